@@ -1,0 +1,102 @@
+"""The motion of the object under the cameras: scan frame, travel, product frame.
+
+A point seen on line v, at (x, z) of the scan plane, lies at ``p = (x, 0, z) + y n`` with y = travel(v).
+Source: Wang et al. 2024, Eq. 10, 11 and 15; the product frame is ours.
+"""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from lsvision.types import Travel
+
+
+def displace(measured: Float[Tensor, "*#batch 3"], n: Float[Tensor, "*#batch 3"]) -> Float[Tensor, "*batch 3"]:
+    """Points p = (x, 0, z) + y n of the moving object, mm, from measured (x, y = travel, z), mm (Eq. 10-11)."""
+    x, y, z = measured.unbind(-1)
+    return torch.stack([x, torch.zeros_like(y), z], dim=-1) + y[..., None] * n
+
+
+def scan_position(points: Float[Tensor, "*#batch 3"], n: Float[Tensor, "*#batch 3"]) -> Float[Tensor, "*batch 3"]:
+    """Measured (x, y = travel, z), mm, of points p of the object, mm: the inverse of ``displace``.
+
+    n must have a part along Y: an object that never crosses the scan plane is never seen, and the result is not finite.
+    """
+    y = points[..., 1] / n[..., 1]
+    return torch.stack([points[..., 0] - y * n[..., 0], y, points[..., 2] - y * n[..., 2]], dim=-1)
+
+
+def product_axes(n: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
+    """Rotation that takes scan-frame vectors to the product frame; its rows are e_x, e_y and e_z.
+
+    e_y is the direction of motion, e_z the viewing direction Z made orthogonal to it, e_x = e_y x e_z. So q_x and q_z
+    do not grow with the line number.
+    """
+    e_y = n / torch.linalg.vector_norm(n, dim=-1, keepdim=True)
+    z = torch.zeros_like(n)
+    z[..., 2] = 1.0
+    e_z = z - e_y[..., 2:3] * e_y
+    e_z = e_z / torch.linalg.vector_norm(e_z, dim=-1, keepdim=True)
+    e_x = torch.linalg.cross(e_y, e_z, dim=-1)
+    return torch.stack([e_x, e_y, e_z], dim=-2)
+
+
+def to_product(measured: Float[Tensor, "*#batch 3"], n: Float[Tensor, "*#batch 3"]) -> Float[Tensor, "*batch 3"]:
+    """Product coordinates q, mm, of measured (x, y = travel, z), mm.
+
+    Written per component, so that q_x and q_z stay exact however far the scan has travelled.
+    """
+    axes = product_axes(n)
+    e_x, e_y, e_z = axes[..., 0, :], axes[..., 1, :], axes[..., 2, :]
+    x, y, z = measured.unbind(-1)
+    q_x = x * e_x[..., 0] + z * e_x[..., 2]
+    q_y = torch.linalg.vector_norm(n, dim=-1) * y + x * e_y[..., 0] + z * e_y[..., 2]
+    q_z = x * e_z[..., 0] + z * e_z[..., 2]
+    return torch.stack([q_x, q_y, q_z], dim=-1)
+
+
+def from_product(product: Float[Tensor, "*#batch 3"], n: Float[Tensor, "*#batch 3"]) -> Float[Tensor, "*batch 3"]:
+    """Measured (x, y = travel, z), mm, of product coordinates q, mm: the inverse of ``to_product``."""
+    return scan_position((product_axes(n).mT @ product[..., None])[..., 0], n)
+
+
+def travel_at(travel: Travel, line: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+    """Nominal travel y, mm, at (fractional) lines; an encoder's log is interpolated, and extended at the line pitch.
+
+    Raises:
+        ValueError: the log does not increase.
+    """
+    sign = -1.0 if travel.transport == "reverse" else 1.0
+    if travel.positions_mm is None:
+        return sign * travel.line_pitch_mm * line
+    log = _checked_log(travel.positions_mm).to(line)
+    if log.numel() == 1:
+        return sign * (log[0] + travel.line_pitch_mm * line)
+    base = line.detach().floor().clamp(0, log.numel() - 2).long()
+    inside = torch.lerp(log[base], log[base + 1], (line - base).clamp(0, 1))
+    beyond = line.clamp(max=0) + (line - (log.numel() - 1)).clamp(min=0)
+    return sign * (inside + travel.line_pitch_mm * beyond)
+
+
+def line_at(travel: Travel, travel_mm: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+    """Fractional line that was scanned at a nominal travel y, mm: the inverse of ``travel_at``.
+
+    Raises:
+        ValueError: the log does not increase.
+    """
+    y = -travel_mm if travel.transport == "reverse" else travel_mm
+    if travel.positions_mm is None:
+        return y / travel.line_pitch_mm
+    log = _checked_log(travel.positions_mm).to(y)
+    if log.numel() == 1:
+        return (y - log[0]) / travel.line_pitch_mm
+    base = (torch.searchsorted(log, y.detach().contiguous(), right=True) - 1).clamp(0, log.numel() - 2)
+    inside = ((y - log[base]) / (log[base + 1] - log[base])).clamp(0, 1)
+    beyond = (y - log[0]).clamp(max=0) + (y - log[-1]).clamp(min=0)
+    return base + inside + beyond / travel.line_pitch_mm
+
+
+def _checked_log(positions_mm: Tensor) -> Tensor:
+    if not bool((positions_mm.diff() > 0).all()):
+        raise ValueError("travel.positions_mm must increase from line to line; repair the encoder log first")
+    return positions_mm

@@ -1,0 +1,122 @@
+"""Rigid transforms: rotation vectors and the best fit between two point sets."""
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+# Below this angle the closed forms of sin(a)/a and (1 - cos a)/a² lose digits; their series do not.
+_SMALL_ANGLE = 1e-3
+
+
+def transform(
+    rotation: Float[Tensor, "*#batch 3 3"],
+    translation: Float[Tensor, "*#batch 3"],
+    points: Float[Tensor, "*#batch points 3"],
+) -> Float[Tensor, "*batch points 3"]:
+    """Points R p + T."""
+    return points @ rotation.mT + translation[..., None, :]
+
+
+def rotation_from_vector(vector: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
+    """Rotation matrix of a rotation vector, rad: Rodrigues' formula, smooth and differentiable at zero."""
+    first, second, _ = _rodrigues_factors(vector)
+    cross = _cross_matrix(vector)
+    eye = torch.eye(3, dtype=vector.dtype, device=vector.device)
+    return eye + first * cross + second * (cross @ cross)
+
+
+def left_jacobian(vector: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
+    """J with exp(v + dv) = exp(J dv) exp(v) to first order: carries a covariance when a rotation is re-centred.
+
+    Source: Chirikjian 2011, Stochastic Models, Information Theory, and Lie Groups, vol. 2, Eq. 10.86.
+    """
+    _, second, third = _rodrigues_factors(vector)
+    cross = _cross_matrix(vector)
+    eye = torch.eye(3, dtype=vector.dtype, device=vector.device)
+    return eye + second * cross + third * (cross @ cross)
+
+
+def vector_from_rotation(rotation: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3"]:
+    """Rotation vector, rad, of a rotation matrix, of length 0..pi; exact to rounding at both ends."""
+    quaternion = _quaternion(rotation)
+    real, imaginary = quaternion[..., 0], quaternion[..., 1:]
+    length = torch.linalg.vector_norm(imaginary, dim=-1)
+    angle = 2.0 * torch.atan2(length, real)
+    scale = torch.where(length > 0, angle / torch.where(length > 0, length, 1.0), 2.0)
+    return scale[..., None] * imaginary
+
+
+def euler_angles(rotation: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3"]:
+    """Angles (about X, Y, Z), rad, with R = Rz Ry Rx. For reports only: they fold at Y = ±pi/2."""
+    about_x = torch.atan2(rotation[..., 2, 1], rotation[..., 2, 2])
+    about_y = torch.asin((-rotation[..., 2, 0]).clamp(-1.0, 1.0))
+    about_z = torch.atan2(rotation[..., 1, 0], rotation[..., 0, 0])
+    return torch.stack([about_x, about_y, about_z], dim=-1)
+
+
+def fit_rigid(
+    source: Float[Tensor, "*#batch points 3"],
+    target: Float[Tensor, "*#batch points 3"],
+    valid: Bool[Tensor, "*#batch points"] | None = None,
+) -> tuple[Float[Tensor, "*batch 3 3"], Float[Tensor, "*batch 3"]]:
+    """Rotation and translation with least squared error ‖R source + T - target‖ over the valid points.
+
+    Args:
+        source, target: corresponding points, mm. Points with ``valid`` false may be NaN.
+
+    Returns:
+        R (proper rotation) and T, mm.
+
+    Source: Kabsch 1976; Umeyama 1991, Eq. 40-43.
+    """
+    source, target = torch.broadcast_tensors(source, target)
+    weight = torch.ones_like(source[..., 0]) if valid is None else valid.expand(source.shape[:-1]).to(source)
+    weight = (weight / weight.sum(-1, keepdim=True))[..., None]
+    source, target = (torch.where(weight > 0, points, 0.0) for points in (source, target))
+    source_mean, target_mean = (weight * source).sum(-2), (weight * target).sum(-2)
+    covariance = (weight * (target - target_mean[..., None, :])).mT @ (source - source_mean[..., None, :])
+    u, _, vh = torch.linalg.svd(covariance)
+    sign = torch.ones_like(u[..., 0])
+    sign[..., 2] = torch.linalg.det(u @ vh).sign()
+    rotation = (u * sign[..., None, :]) @ vh
+    return rotation, target_mean - (rotation @ source_mean[..., None])[..., 0]
+
+
+def _cross_matrix(vector: Tensor) -> Tensor:
+    x, y, z = vector.unbind(-1)
+    zero = torch.zeros_like(x)
+    rows = [torch.stack([zero, -z, y], -1), torch.stack([z, zero, -x], -1), torch.stack([-y, x, zero], -1)]
+    return torch.stack(rows, dim=-2)
+
+
+def _rodrigues_factors(vector: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """sin(a)/a, (1 - cos a)/a² and (a - sin a)/a³ of the angle a, each (*batch, 1, 1)."""
+    squared = (vector * vector).sum(-1)[..., None, None]
+    small = squared < _SMALL_ANGLE**2
+    safe = torch.where(small, 1.0, squared)  # keeps NaN out of the gradient of the branch not taken
+    angle = safe.sqrt()
+    first = torch.where(small, 1 - squared / 6 + squared**2 / 120, torch.sin(angle) / angle)
+    second = torch.where(small, 0.5 - squared / 24 + squared**2 / 720, 2 * torch.sin(angle / 2) ** 2 / safe)
+    third = torch.where(small, 1 / 6 - squared / 120 + squared**2 / 5040, (angle - torch.sin(angle)) / (safe * angle))
+    return first, second, third
+
+
+def _quaternion(rotation: Tensor) -> Tensor:
+    """Unit quaternion (real part first, not negative), by the largest of four equivalent forms (Shepperd 1978)."""
+    m = rotation
+    d0, d1, d2 = m[..., 0, 0], m[..., 1, 1], m[..., 2, 2]
+    a, b, c = m[..., 2, 1] - m[..., 1, 2], m[..., 0, 2] - m[..., 2, 0], m[..., 1, 0] - m[..., 0, 1]
+    ab, ac, bc = m[..., 1, 0] + m[..., 0, 1], m[..., 2, 0] + m[..., 0, 2], m[..., 2, 1] + m[..., 1, 2]
+    forms = torch.stack(
+        [
+            torch.stack([1 + d0 + d1 + d2, a, b, c], -1),
+            torch.stack([a, 1 + d0 - d1 - d2, ab, ac], -1),
+            torch.stack([b, ab, 1 - d0 + d1 - d2, bc], -1),
+            torch.stack([c, ac, bc, 1 - d0 - d1 + d2], -1),
+        ],
+        dim=-2,
+    )
+    largest = forms.diagonal(dim1=-2, dim2=-1).argmax(-1)[..., None, None].expand(*forms.shape[:-2], 1, 4)
+    chosen = forms.gather(-2, largest)[..., 0, :]
+    chosen = chosen / torch.linalg.vector_norm(chosen, dim=-1, keepdim=True)
+    return torch.where(chosen[..., :1] < 0, -chosen, chosen)

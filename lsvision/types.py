@@ -1,0 +1,227 @@
+"""The frozen dataclasses that flow between the stages.
+
+Units are millimetres, pixels and lines; angles are radians unless a name ends in ``_deg``. Pixel centres are integers.
+Leading batch dimensions are written ``*batch``. Frames are those of the README's convention table: scan frame S, board
+frame C, product frame M.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal, Protocol
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+Transport = Literal["forward", "reverse"]
+CalibrationMethod = Literal["joint", "two_step", "sequential", "least_squares"]
+
+
+@dataclass(frozen=True)
+class Rig:
+    """A rectified pair of line cameras: both sensors on one line, optical axes parallel (Eq. 2).
+
+    ``color_spacing_lines`` is where the red, green and blue sensor lines look along Y, in nominal lines, for a
+    trilinear sensor; (0, 0, 0) where all three see the same line of the object.
+    """
+
+    width_px: int
+    pixel_pitch_um: float
+    focal_length_mm: float
+    baseline_mm: float
+    principal_left_px: float
+    principal_right_px: float
+    color_spacing_lines: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    @property
+    def focal_length_px(self) -> float:
+        """Focal length over pixel pitch."""
+        return self.focal_length_mm / (self.pixel_pitch_um * 1e-3)
+
+    @property
+    def zero_disparity_mm(self) -> float:
+        """Depth z0 of the plane that both cameras see in the same column; the zero of heights."""
+        return self.focal_length_px * self.baseline_mm / (self.principal_right_px - self.principal_left_px)
+
+    @property
+    def object_pitch_mm(self) -> float:
+        """Distance of neighbouring pixels on the object, at the plane of zero disparity."""
+        return self.zero_disparity_mm / self.focal_length_px
+
+
+@dataclass(frozen=True)
+class Board:
+    """A checkerboard of ``columns x rows`` squares; the longer side, X, comes first."""
+
+    columns: int
+    rows: int
+    square_mm: float
+
+    @property
+    def inner(self) -> tuple[int, int]:
+        """Number of inner corners along X and along Y."""
+        return self.columns - 1, self.rows - 1
+
+    def corner_points(self) -> Float[Tensor, "corners 3"]:
+        """Inner corners in the board frame, row by row from the origin, X fastest; float64, mm."""
+        nx, ny = self.inner
+        y, x = torch.meshgrid(
+            torch.arange(ny, dtype=torch.float64), torch.arange(nx, dtype=torch.float64), indexing="ij"
+        )
+        return torch.stack([x, y, torch.zeros_like(x)], dim=-1).reshape(-1, 3) * self.square_mm
+
+
+@dataclass(frozen=True)
+class Travel:
+    """Nominal travel of the object by line: constant pitch, or an encoder's position log.
+
+    ``positions_mm`` holds one position per line, increasing, and replaces the pitch where it is given. A reversed
+    transport makes later lines see smaller Y.
+    """
+
+    line_pitch_mm: float
+    positions_mm: Float[Tensor, " lines"] | None = None
+    transport: Transport = "forward"
+
+
+class LineImage(Protocol):
+    """A tall image read by line ranges; nothing ever loads the whole of it."""
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """(lines, width, channels)."""
+        ...
+
+    @property
+    def dtype(self) -> torch.dtype:
+        """uint8, uint16 or float32."""
+        ...
+
+    def read(self, start: int, stop: int) -> Tensor:
+        """Lines ``start..stop-1`` as a tensor ``(stop - start, width, channels)``."""
+        ...
+
+
+@dataclass(frozen=True)
+class Scan:
+    """One pass of an object under the rig: two images, or one image and the depth map a camera computed."""
+
+    path: Path
+    rig: Rig
+    travel: Travel
+    left: LineImage
+    right: LineImage | None
+    depth: LineImage | None
+    color_registered: bool = True
+    attributes: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def lines(self) -> int:
+        """Number of lines of the scan."""
+        return self.left.shape[0]
+
+
+@dataclass(frozen=True)
+class BoardCorners:
+    """The corners of one board in one scan, measured and true.
+
+    ``points`` are the measured ``(x, travel, z)`` of every corner in the order of ``board_points``; ``covariance`` is
+    theirs, mm². A corner with ``valid`` false was not seen; its point is NaN.
+    """
+
+    scan: str
+    points: Float[Tensor, "corners 3"]
+    covariance: Float[Tensor, "corners 3 3"]
+    valid: Bool[Tensor, " corners"]
+    board_points: Float[Tensor, "corners 3"]
+    left_px: Float[Tensor, "corners 2"]
+    right_px: Float[Tensor, "corners 2"] | None = None
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Displacement ``n`` of the object in mm per nominal mm of travel, and how well it is known."""
+
+    n: Float[Tensor, "3"]
+    covariance: Float[Tensor, "3 3"]
+
+    @property
+    def stretch(self) -> float:
+        """Length of n: true over nominal travel."""
+        return float(torch.linalg.vector_norm(self.n))
+
+    @property
+    def sigma(self) -> Float[Tensor, "3"]:
+        """Standard deviation of each component of n."""
+        return self.covariance.diagonal(dim1=-2, dim2=-1).sqrt()
+
+
+@dataclass(frozen=True)
+class Iteration:
+    """State of a calibration after one iteration."""
+
+    rmse_mm: float
+    n: tuple[float, float, float]
+    stretch: float
+
+
+@dataclass(frozen=True)
+class BoardFit:
+    """Pose of one board, ``p_scan = R p_board + T``, and its residuals before and after calibration."""
+
+    scan: str
+    corners: int
+    rotation: Float[Tensor, "3 3"]
+    translation_mm: Float[Tensor, "3"]
+    rmse_before_mm: float
+    rmse_after_mm: float
+
+
+@dataclass(frozen=True)
+class ObservedDirection:
+    """A direction of n and how much the data narrowed the prior along it."""
+
+    vector: tuple[float, float, float]
+    prior_sigma: float
+    posterior_sigma: float
+    observed: bool
+
+
+@dataclass(frozen=True)
+class Observability:
+    """Whether the boards determine n, direction by direction, and what to scan next."""
+
+    verdict: Literal["determined", "prior-dominated"]
+    directions: tuple[ObservedDirection, ...]
+    advice: str
+
+
+@dataclass(frozen=True)
+class Provenance:
+    """What a calibration was made from: version, configuration and the scans with their hashes."""
+
+    version: str
+    config_sha256: str
+    scans: tuple[tuple[str, str], ...] = ()
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """The motion of an object under a rig, measured on one or more boards."""
+
+    method: CalibrationMethod
+    motion: Motion
+    rmse_before_mm: float
+    rmse_after_mm: float
+    iterations: tuple[Iteration, ...]
+    boards: tuple[BoardFit, ...]
+    observability: Observability
+    rig: Rig
+    converged: bool = True
+    provenance: Provenance = field(default_factory=lambda: Provenance("", ""))
+
+    @property
+    def improvement(self) -> float:
+        """Share of the RMSE that the calibration removed, 1 - after / before."""
+        return 1.0 - self.rmse_after_mm / self.rmse_before_mm

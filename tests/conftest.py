@@ -1,0 +1,34 @@
+"""Shapes are checked while the tests run; every test starts from one seed and one thread."""
+
+from pathlib import Path
+
+import jaxtyping
+import pytest
+
+jaxtyping.install_import_hook(["lsvision.geometry", "lsvision.estimation", "lsvision.image"], "beartype.beartype")
+
+import torch  # noqa: E402
+
+SHARED_DATA = Path(__file__).parents[2] / "shared" / "data"
+
+
+@pytest.fixture(autouse=True)
+def _seeded() -> None:
+    torch.manual_seed(0)
+    torch.set_num_threads(1)
+
+
+@pytest.fixture(scope="session")
+def shared_data() -> Path:
+    """Real photographs and scans by another renderer, where the folder is present."""
+    if not SHARED_DATA.is_dir():
+        pytest.skip(f"{SHARED_DATA} is not here: the checks on scans from elsewhere did not run")
+    return SHARED_DATA
+
+
+@pytest.fixture
+def rig():
+    """The 3DPIXA-class rig at a quarter of its pixels."""
+    from lsvision.types import Rig
+
+    return Rig(1786, 40.0, 113.84, 354.0, 260.125, 1524.375)
