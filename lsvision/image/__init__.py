@@ -1,0 +1,1 @@
+"""Operations on image tensors: checkerboard corners, matching, visible-surface maps, resampling."""

@@ -1,0 +1,169 @@
+"""Checkerboards in images: the grid on a reduced copy, its order from the colours, its corners at full size."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+import torch.nn.functional as F  # noqa: N812
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from lsvision.image.saddle import SaddleFit, fit_saddles
+from lsvision.types import Board, LineImage
+
+# Luma of ITU-R BT.601; any fixed weights would do, both views only have to share them.
+_LUMA = (0.299, 0.587, 0.114)
+_REDUCED_WIDTH = 900  # columns in which the coarse search runs: squares of a full-field board still have 40 px
+_READ_LINES = 512
+
+
+@dataclass(frozen=True)
+class DetectedCorners:
+    """Corners of one board in one image, in the board's order: (column, line) px, covariance px², seen or not."""
+
+    position: Float[Tensor, "corners 2"]
+    covariance: Float[Tensor, "corners 2 2"]
+    valid: Bool[Tensor, " corners"]
+
+
+def gray(lines: Tensor) -> Float[Tensor, "lines width"]:
+    """Brightness of ``(lines, width, 1 or 3)`` values of any type as float32 on their own scale."""
+    values = lines.to(torch.float32)
+    if values.shape[-1] == 1:
+        return values[..., 0]
+    return values[..., :3] @ values.new_tensor(_LUMA)
+
+
+def detect_board(image: LineImage, board: Board, *, mirrored: bool = False) -> DetectedCorners | None:
+    """Find a board in an image of any length and locate its inner corners.
+
+    Args:
+        image: read by line ranges, twice: reduced for the search, then a window around each corner.
+        mirrored: the image is the mirror image of the object (reversed transport).
+
+    Returns:
+        Corners in the order of ``Board.corner_points``, or None where there is no board.
+    """
+    factor = max(1, round(image.shape[1] / _REDUCED_WIDTH))
+    reduced = reduce_image(image, factor)
+    grid = find_grid(reduced, board.inner)
+    if grid is None:
+        return None
+    ordered = order_grid(grid, reduced, mirrored=mirrored)
+    return refine_grid(image, (ordered + 0.5) * factor - 0.5)
+
+
+def reduce_image(image: LineImage, factor: int) -> Float[Tensor, "lines width"]:
+    """Brightness of an image averaged over blocks of ``factor x factor`` px; an incomplete last block is left out."""
+    lines, width, _ = image.shape
+    kept = width - width % factor
+    blocks = []
+    step = max(factor, _READ_LINES - _READ_LINES % factor)
+    for start in range(0, lines - lines % factor, step):
+        stop = min(start + step, lines - lines % factor)
+        blocks.append(F.avg_pool2d(gray(image.read(start, stop))[None, :, :kept], factor)[0])
+    return torch.cat(blocks) if blocks else torch.zeros(0, kept // factor)
+
+
+def find_grid(brightness: Float[Tensor, "lines width"], inner: tuple[int, int]) -> Float[Tensor, "rows columns 2"] | None:
+    """Inner corners of a board as a grid of (u, v) px, columns along the longer side; None where none is seen.
+
+    The order along either side, and so the handedness, is left open: ``order_grid`` settles it.
+    """
+    if min(brightness.shape) < 2 * max(inner):
+        return None
+    picture = _stretched_to_bytes(brightness)
+    flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE
+    found, corners = cv2.findChessboardCornersSB(picture, inner, flags=flags)
+    if not found:
+        flags = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
+        found, corners = cv2.findChessboardCorners(picture, inner, flags=flags)
+    if not found:
+        return None
+    # OpenCV 4 returns (N, 1, 2), OpenCV 5 (N, 2).
+    points = torch.from_numpy(np.asarray(corners, dtype=np.float64).reshape(-1, 2))
+    return points.reshape(inner[1], inner[0], 2)
+
+
+def order_grid(
+    grid: Float[Tensor, "rows columns 2"], brightness: Float[Tensor, "lines width"], *, mirrored: bool = False
+) -> Float[Tensor, "rows columns 2"]:
+    """Turn a grid so that X runs from the side with two black corner squares and the frame is right-handed.
+
+    The squares between the corners decide: in the right order the square beside the origin is black, as is every
+    second one. A board whose sides have an even sum of squares looks the same upside down; it keeps the order in which
+    X runs towards larger columns.
+    """
+    x, y = (grid[:, -1] - grid[:, 0]).mean(0), (grid[-1] - grid[0]).mean(0)
+    right_handed = bool(x[0] * y[1] - x[1] * y[0] > 0)
+    if right_handed == mirrored:
+        grid = grid.flip(0)
+    score = _pattern_score(grid, brightness)
+    turned = grid.flip(0, 1)
+    turned_score = _pattern_score(turned, brightness)
+    if abs(score - turned_score) < 1e-6 * (abs(score) + abs(turned_score)):
+        return grid if bool(x[0] >= 0) else turned
+    return grid if score > turned_score else turned
+
+
+def refine_grid(image: LineImage, grid: Float[Tensor, "rows columns 2"]) -> DetectedCorners:
+    """Locate corners at full size, from a grid good to about two pixels: one batch of windows, fitted together."""
+    points = grid.reshape(-1, 2)
+    along_x, along_y = _neighbour_vectors(grid)
+    spacing = torch.minimum(along_x.norm(dim=-1), along_y.norm(dim=-1)).min()
+    radius = int((0.35 * spacing).clamp(3, 12))
+    centre = points.round().long()
+    windows, inside = _windows(image, centre, radius)
+    # The edge along X has its normal a quarter turn from the tangent along X.
+    angles = torch.stack([torch.atan2(d[:, 1], d[:, 0]) + torch.pi / 2 for d in (along_x, along_y)], dim=-1)
+    fit = fit_saddles(windows, angles.to(windows))
+    return _detected(fit, centre, inside)
+
+
+def _detected(fit: SaddleFit, centre: Tensor, inside: Tensor) -> DetectedCorners:
+    valid = fit.valid & inside
+    position = torch.where(valid[:, None], centre + fit.position, torch.nan)
+    covariance = torch.where(valid[:, None, None], fit.covariance, torch.nan)
+    return DetectedCorners(position, covariance, valid)
+
+
+def _windows(image: LineImage, centre: Tensor, radius: int) -> tuple[Tensor, Tensor]:
+    """Square windows (corners, size, size), float64, and which of them lie within the image."""
+    lines, width, _ = image.shape
+    inside = ((centre >= radius) & (centre < torch.tensor([width, lines]) - radius)).all(-1)
+    size = 2 * radius + 1
+    windows = torch.zeros(centre.shape[0], size, size, dtype=torch.float64)
+    span = torch.arange(size) - radius
+    for start in range(0, lines, _READ_LINES):
+        here = inside & (centre[:, 1] - radius >= start) & (centre[:, 1] - radius < start + _READ_LINES)
+        if not bool(here.any()):
+            continue
+        strip = gray(image.read(start, min(lines, start + _READ_LINES + size))).to(torch.float64)
+        rows = (centre[here, 1, None] + span - start)[:, :, None]
+        columns = (centre[here, 0, None] + span)[:, None, :]
+        windows[here] = strip[rows, columns]
+    return windows, inside
+
+
+def _neighbour_vectors(grid: Tensor) -> tuple[Tensor, Tensor]:
+    """Step to the next corner along X and along Y, (corners, 2) each: central differences, one-sided at the rim."""
+    along_y, along_x = torch.gradient(grid, dim=(0, 1))
+    return along_x.reshape(-1, 2), along_y.reshape(-1, 2)
+
+
+def _pattern_score(grid: Tensor, brightness: Tensor) -> float:
+    """How much darker the squares are that should be black, if this were the right order."""
+    centres = (grid[:-1, :-1] + grid[1:, :-1] + grid[:-1, 1:] + grid[1:, 1:]) / 4
+    scale = torch.tensor([max(n - 1, 1) for n in (brightness.shape[1], brightness.shape[0])], dtype=torch.float64)
+    normalised = (2 * centres / scale - 1).to(torch.float32)
+    smooth = F.avg_pool2d(brightness[None, None], 3, stride=1, padding=1)
+    seen = F.grid_sample(smooth, normalised[None], align_corners=True)[0, 0]
+    row, column = torch.meshgrid(torch.arange(seen.shape[0]), torch.arange(seen.shape[1]), indexing="ij")
+    black = (row + column) % 2 == 0
+    return float(seen[~black].mean() - seen[black].mean())
+
+
+def _stretched_to_bytes(brightness: Tensor) -> np.ndarray:
+    low, high = torch.aminmax(brightness)
+    return ((brightness - low) * (255.0 / max(float(high - low), 1e-6))).to(torch.uint8).numpy()

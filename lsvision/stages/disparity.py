@@ -1,0 +1,122 @@
+"""Scan -> Disparity -> depth: matching strip by strip, and the depth map that follows from it."""
+
+import math
+from collections import OrderedDict
+from dataclasses import dataclass, field
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from lsvision.geometry import triangulate
+from lsvision.image.matching import match_sgbm
+from lsvision.types import LineImage, Rig, Scan
+
+
+@dataclass(frozen=True)
+class DisparityConfig:
+    """Semi-global matching at the paper's settings.
+
+    The search range is given in heights over the plane of zero disparity, mm, positive towards the cameras: -26.9..25.2
+    is -165..+165 px on the full 3DPIXA and the same 52 mm on any other rig. ``lambda1`` and ``lambda2`` penalise a
+    change of disparity by one and by more, per pixel of the block. ``strip_lines`` are matched at once, with
+    ``halo_lines`` beyond either end that are thrown away.
+    """
+
+    matcher: Literal["sgbm"] = "sgbm"
+    height_range_mm: tuple[float, float] = (-26.9, 25.2)
+    block_size: int = 5
+    lambda1: float = 8.0
+    lambda2: float = 32.0
+    left_right_check_px: int = 10
+    uniqueness_percent: int = 5
+    speckle_px: int = 100
+    strip_lines: int = 512
+    halo_lines: int = 24
+
+
+def disparity_range(rig: Rig, config: DisparityConfig) -> tuple[int, int]:
+    """Lowest and highest disparity, px, that the configured heights ask for on a rig."""
+    convergence = rig.principal_right_px - rig.principal_left_px
+    low, high = (
+        convergence * (rig.zero_disparity_mm / (rig.zero_disparity_mm - height) - 1) for height in config.height_range_mm
+    )
+    return math.floor(low), math.ceil(high)
+
+
+def match_strip(left: Tensor, right: Tensor, rig: Rig, config: DisparityConfig) -> Tensor:
+    """Disparity, px, of a pair of strips ``(lines, width, channels)``; NaN where there is no match."""
+    minimum_px, maximum_px = disparity_range(rig, config)
+    return match_sgbm(
+        left,
+        right,
+        minimum_px=minimum_px,
+        maximum_px=maximum_px,
+        block_size=config.block_size,
+        lambda1=config.lambda1,
+        lambda2=config.lambda2,
+        left_right_check_px=config.left_right_check_px,
+        uniqueness_percent=config.uniqueness_percent,
+        speckle_px=config.speckle_px,
+    )
+
+
+def depth_from_disparity(disparity: Tensor, rig: Rig) -> Tensor:
+    """Depth z, mm, of a disparity strip ``(lines, width)``, in the strip's dtype; NaN stays NaN."""
+    column = torch.arange(disparity.shape[-1], dtype=torch.float64).expand(disparity.shape)
+    return triangulate(rig, column, disparity.to(torch.float64))[1].to(disparity.dtype)
+
+
+@dataclass
+class MatchedDepth:
+    """The depth map of a stereo scan as a ``LineImage``: float32 z in mm, NaN for none, matched where it is read.
+
+    Strips lie at fixed multiples of ``strip_lines``, so a line's depth does not depend on the range it is read in. The
+    last strips stay in memory, since neighbouring reads overlap.
+    """
+
+    scan: Scan
+    config: DisparityConfig = field(default_factory=DisparityConfig)
+    kept_strips: int = 6
+    _strips: OrderedDict[int, Tensor] = field(default_factory=OrderedDict, init=False, repr=False)
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """(lines, width, 1)."""
+        return self.scan.lines, self.scan.rig.width_px, 1
+
+    @property
+    def dtype(self) -> torch.dtype:
+        """float32."""
+        return torch.float32
+
+    def read(self, start: int, stop: int) -> Tensor:
+        """Depth of lines ``start..stop-1``, ``(stop - start, width, 1)`` in mm."""
+        first = start // self.config.strip_lines
+        last = (stop - 1) // self.config.strip_lines
+        depth = torch.cat([self._strip(index) for index in range(first, last + 1)])
+        offset = first * self.config.strip_lines
+        return depth[start - offset : stop - offset, :, None]
+
+    def _strip(self, index: int) -> Tensor:
+        if index not in self._strips:
+            self._strips[index] = self._match(index)
+            while len(self._strips) > self.kept_strips:
+                self._strips.popitem(last=False)
+        self._strips.move_to_end(index)
+        return self._strips[index]
+
+    def _match(self, index: int) -> Tensor:
+        assert self.scan.right is not None
+        start = index * self.config.strip_lines
+        stop = min(start + self.config.strip_lines, self.scan.lines)
+        above, below = max(start - self.config.halo_lines, 0), min(stop + self.config.halo_lines, self.scan.lines)
+        disparity = match_strip(
+            self.scan.left.read(above, below), self.scan.right.read(above, below), self.scan.rig, self.config
+        )
+        return depth_from_disparity(disparity, self.scan.rig)[start - above : stop - above]
+
+
+def depth_of(scan: Scan, config: DisparityConfig) -> LineImage:
+    """The scan's own depth map where a camera computed one, else the one matched from its two images."""
+    return scan.depth if scan.depth is not None else MatchedDepth(scan, config)
