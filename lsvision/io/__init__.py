@@ -1,0 +1,30 @@
+"""Files: rig, scan, calibration and product; read by line ranges, checked on reading, complete under a final name."""
+
+from lsvision.io.calibration import check_rig_match, read_calibration, write_calibration
+from lsvision.io.encoder import read_encoder, write_encoder
+from lsvision.io.line_image import open_line_image
+from lsvision.io.ply import write_ply
+from lsvision.io.product import Product, ProductWriter, read_product
+from lsvision.io.rig import read_rig, rig_from_dict, rig_to_dict, write_rig
+from lsvision.io.scan import read_scan, write_scan
+from lsvision.io.tiff import write_line_image
+
+__all__ = [
+    "Product",
+    "ProductWriter",
+    "check_rig_match",
+    "open_line_image",
+    "read_calibration",
+    "read_encoder",
+    "read_product",
+    "read_rig",
+    "read_scan",
+    "rig_from_dict",
+    "rig_to_dict",
+    "write_calibration",
+    "write_encoder",
+    "write_line_image",
+    "write_ply",
+    "write_rig",
+    "write_scan",
+]

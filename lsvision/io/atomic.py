@@ -1,0 +1,76 @@
+"""Writing aside and renaming when complete: a final name never holds half a result."""
+
+import os
+import shutil
+import uuid
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from lsvision.errors import FileFormatError
+
+
+@contextmanager
+def partial_file(target: Path | str) -> Iterator[Path]:
+    """Yield a hidden path beside ``target`` to write to; it takes the target's name on success, else it is removed."""
+    target = Path(target).resolve()
+    target.parent.mkdir(parents=True, exist_ok=True)
+    partial = _hidden_sibling(target)
+    try:
+        yield partial
+        partial.replace(target)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+@contextmanager
+def partial_folder(target: Path | str, *, marker: str) -> Iterator[Path]:
+    """Yield a hidden folder beside ``target`` to fill; it takes the target's name on success, else it is removed.
+
+    Args:
+        target: final folder. An existing one is replaced only where nothing else can be lost by it.
+        marker: file name that tells a folder of this kind, and so one that may be replaced.
+
+    Raises:
+        FileFormatError: ``target`` exists, is not empty and does not hold ``marker``.
+    """
+    target = Path(target).resolve()
+    if target.exists() and not _replaceable(target, marker):
+        raise FileFormatError(target, f"expected a new or empty folder, or one with {marker} to replace")
+    target.parent.mkdir(parents=True, exist_ok=True)
+    partial = _hidden_sibling(target)
+    partial.mkdir()
+    try:
+        yield partial
+        _take_over(partial, target)
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+
+
+def write_text(path: Path | str, text: str) -> None:
+    """Write a text file, UTF-8, in one step."""
+    with partial_file(path) as partial:
+        partial.write_text(text, encoding="utf-8")
+
+
+def _hidden_sibling(target: Path) -> Path:
+    # Beside the target, so that the rename stays within one file system; unique, so that two writers never meet.
+    return target.with_name(f".{target.name}.{uuid.uuid4().hex}.partial")
+
+
+def _replaceable(target: Path, marker: str) -> bool:
+    return target.is_dir() and ((target / marker).is_file() or not any(target.iterdir()))
+
+
+def _take_over(partial: Path, target: Path) -> None:
+    if not target.exists():
+        partial.rename(target)
+        return
+    retired = _hidden_sibling(target)
+    target.rename(retired)
+    try:
+        os.rename(partial, target)
+    except OSError:
+        retired.rename(target)
+        raise
+    shutil.rmtree(retired)

@@ -1,0 +1,70 @@
+"""A small scan on disk and the calibration that goes with it."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import torch
+
+from lsvision.io import write_scan
+from lsvision.types import (
+    BoardFit,
+    Calibration,
+    Iteration,
+    Motion,
+    Observability,
+    ObservedDirection,
+    Provenance,
+    Rig,
+    Travel,
+)
+
+LINES, WIDTH = 300, 32
+
+
+@pytest.fixture
+def small_rig() -> Rig:
+    return Rig(WIDTH, 80.0, 113.84, 354.0, 4.5, 27.25)
+
+
+@pytest.fixture
+def images() -> tuple[torch.Tensor, torch.Tensor]:
+    return tuple(torch.randint(0, 256, (2, LINES, WIDTH, 3), dtype=torch.uint8))
+
+
+@pytest.fixture
+def make_scan(tmp_path: Path, small_rig: Rig, images) -> Callable[..., Path]:
+    """Write a small scan; keyword arguments replace those of ``write_scan``."""
+
+    def make(name: str = "scan", **changes: object) -> Path:
+        left, right = images
+        arguments = {
+            "rig": small_rig,
+            "travel": Travel(0.56),
+            "left": [left[:100], left[100:]],
+            "right": [right],
+            "lines": LINES,
+        }
+        write_scan(tmp_path / name, **(arguments | changes))
+        return tmp_path / name
+
+    return make
+
+
+@pytest.fixture
+def calibration(small_rig: Rig) -> Calibration:
+    n = torch.tensor([-0.0257, 0.9845, 0.1 + 0.2], dtype=torch.float64)
+    root = torch.randn(3, 3, dtype=torch.float64) * 1e-4
+    board = BoardFit("scans/Tür 1", 88, torch.eye(3).double(), torch.tensor([1.0, 2.0, 797.3]).double(), 2.1, 0.05)
+    direction = ObservedDirection((0.0, 0.6, 0.8), 0.05, 2.5e-5, True)
+    return Calibration(
+        method="joint",
+        motion=Motion(n, root @ root.mT),
+        rmse_before_mm=2.059,
+        rmse_after_mm=0.8794,
+        iterations=(Iteration(2.059, (0.0, 1.0, 0.0), 1.0), Iteration(1 / 3, (-0.02, 0.98, 0.3), 1.02)),
+        boards=(board,),
+        observability=Observability("determined", (direction,), "tilt the board by 15° about the sensor axis"),
+        rig=small_rig,
+        provenance=Provenance("0.1.0", "ab" * 32, (("scans/a", "cd" * 32),)),
+    )

@@ -1,0 +1,138 @@
+import json
+import math
+from collections.abc import Callable
+from dataclasses import fields, is_dataclass, replace
+from pathlib import Path
+
+import pytest
+import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from lsvision.errors import CalibrationError, FileFormatError
+from lsvision.io import check_rig_match, read_calibration, read_scan, write_calibration
+from lsvision.types import Calibration, Motion
+
+
+def plain(value: object) -> object:
+    """Dataclasses and tensors as nested lists, to be compared to the bit."""
+    if is_dataclass(value):
+        return [plain(getattr(value, field.name)) for field in fields(value)]
+    if isinstance(value, torch.Tensor):
+        return value.tolist()
+    return [plain(item) for item in value] if isinstance(value, tuple) else value
+
+
+def test_round_trip_is_exact(tmp_path: Path, calibration: Calibration) -> None:
+    write_calibration(calibration, tmp_path / "calibration.json")
+    assert plain(read_calibration(tmp_path / "calibration.json")) == plain(calibration)
+
+
+@settings(deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    n=st.tuples(st.floats(-0.2, 0.2), st.floats(0.5, 2.0), st.floats(-0.2, 0.2)),
+    variances=st.lists(st.floats(0, 1), min_size=3, max_size=3),
+)
+def test_any_motion_round_trips(tmp_path: Path, calibration: Calibration, n: tuple, variances: list) -> None:
+    motion = Motion(torch.tensor(n).double(), torch.tensor(variances).double().diag())
+    write_calibration(replace(calibration, motion=motion), tmp_path / "calibration.json")
+    assert plain(read_calibration(tmp_path / "calibration.json").motion) == plain(motion)
+
+
+def test_file_has_the_documented_keys(tmp_path: Path, calibration: Calibration) -> None:
+    motion = Motion(
+        torch.tensor([0.1, 1.0, -0.2]).double(), torch.diag(torch.tensor([4.0, 9.0, 16.0])).double() * 1e-10
+    )
+    write_calibration(replace(calibration, motion=motion), tmp_path / "calibration.json")
+    data = json.loads((tmp_path / "calibration.json").read_text())
+    assert list(data) == [
+        *("format", "method", "converged", "motion", "rmse_before_mm", "rmse_after_mm", "improvement"),
+        *("iterations", "boards", "observability", "rig", "provenance"),
+    ]
+    assert list(data["motion"]) == ["n", "stretch", "angles_deg", "covariance", "sigma"]
+    assert data["motion"]["stretch"] == pytest.approx(math.sqrt(1.05))
+    assert data["motion"]["angles_deg"] == pytest.approx({"x": 5.710593137499643, "z": -11.309932474020213})
+    assert data["motion"]["sigma"] == pytest.approx([2e-5, 3e-5, 4e-5])
+    assert data["improvement"] == pytest.approx(1 - 0.8794 / 2.059)
+    assert list(data["iterations"][0]) == ["rmse_mm", "n", "stretch"]
+    assert list(data["boards"][0]) == [
+        *("scan", "corners", "rotation", "translation_mm", "rmse_before_mm", "rmse_after_mm")
+    ]
+    assert list(data["observability"]) == ["verdict", "directions", "advice"]
+    assert list(data["observability"]["directions"][0]) == ["vector", "prior_sigma", "posterior_sigma", "observed"]
+    assert list(data["provenance"]) == ["version", "config_sha256", "scans"]
+    assert list(data["provenance"]["scans"][0]) == ["path", "sha256"]
+
+
+def test_what_follows_from_n_may_be_left_out(tmp_path: Path, calibration: Calibration) -> None:
+    file = tmp_path / "calibration.json"
+    write_calibration(calibration, file)
+    data = json.loads(file.read_text())
+    for key in ("stretch", "angles_deg", "sigma"):
+        del data["motion"][key]
+    del data["improvement"], data["converged"]
+    file.write_text(json.dumps(data))
+    assert plain(read_calibration(file)) == plain(calibration)
+
+
+def assign(data: dict, key: str, value: object) -> None:
+    *path, last = key.split(".")
+    for part in path:
+        data = data[int(part) if part.isdigit() else part]
+    data[int(last) if last.isdigit() else last] = value
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "message"),
+    [
+        ("format", "lsvision-calibration/2", "format: expected 'lsvision-calibration/1'"),
+        ("method", "guess", "method: expected 'joint' or"),
+        ("motion.n.1", math.nan, r"motion.n\[1\]: expected a finite number, got nan"),
+        ("motion.n.0", math.inf, r"motion.n\[0\]: expected a finite number, got inf"),
+        ("motion.n", [0.0, 1.0], r"motion.n: expected a list of 3, got \[0.0, 1.0\]"),
+        ("motion.n.1", 0.0, r"motion.n\[1\]: expected a number > 0"),
+        ("motion.covariance.2.1", math.nan, r"motion.covariance\[2\]\[1\]: expected a finite number, got nan"),
+        ("motion.covariance", [[1, 0, 0], [1, 1, 0], [0, 0, 1]], "motion.covariance: expected a symmetric"),
+        ("motion.covariance", [[1, 2, 0], [2, 1, 0], [0, 0, 1]], "motion.covariance: expected a positive semidefinite"),
+        ("motion.speed", 1.0, "motion.speed: unknown key"),
+        ("boards.0.rotation.1.2", math.nan, r"boards\[0\].rotation\[1\]\[2\]: expected a finite number, got nan"),
+        ("boards.0.corners", 0, r"boards\[0\].corners: expected a whole number >= 1"),
+        ("boards", {}, "boards: expected a list"),
+        ("iterations.1.rmse_mm", -1, r"iterations\[1\].rmse_mm: expected a finite number >= 0, got -1"),
+        ("rmse_after_mm", "small", "rmse_after_mm: expected a finite number >= 0, got 'small'"),
+        ("observability.verdict", "maybe", "observability.verdict: expected 'determined' or 'prior-dominated'"),
+        ("observability.directions.0.observed", 1, r"observability.directions\[0\].observed: expected true or false"),
+        ("rig.baseline_mm", math.nan, "rig.baseline_mm: expected a finite number > 0, got nan"),
+        ("provenance.scans.0.path", None, r"provenance.scans\[0\].path: expected text, got null"),
+        ("extra", 1, "extra: unknown key"),
+    ],
+)
+def test_bad_entries_are_named(tmp_path: Path, calibration: Calibration, key: str, value: object, message: str) -> None:
+    file = tmp_path / "calibration.json"
+    write_calibration(calibration, file)
+    data = json.loads(file.read_text())
+    assign(data, key, value)
+    file.write_text(json.dumps(data))
+    with pytest.raises(FileFormatError, match=message):
+        read_calibration(file)
+
+
+@pytest.mark.parametrize("text", ["", "{", "[" * 100_000])
+def test_not_json(tmp_path: Path, text: str) -> None:
+    (tmp_path / "calibration.json").write_text(text)
+    with pytest.raises(FileFormatError, match=r"calibration\.json: expected JSON"):
+        read_calibration(tmp_path / "calibration.json")
+
+
+def test_nan_is_not_written(tmp_path: Path, calibration: Calibration) -> None:
+    with pytest.raises(ValueError):
+        write_calibration(replace(calibration, rmse_after_mm=math.nan), tmp_path / "calibration.json")
+    assert not any(tmp_path.iterdir())
+
+
+def test_calibration_for_another_rig(calibration: Calibration, make_scan: Callable[..., Path]) -> None:
+    scan = read_scan(make_scan())
+    check_rig_match(calibration, scan)
+    other = replace(calibration, rig=replace(calibration.rig, focal_length_mm=120.0))
+    with pytest.raises(CalibrationError, match=r"scan: .* another rig: focal_length_mm 120.0, the scan's is 113.84"):
+        check_rig_match(other, scan)
