@@ -104,6 +104,28 @@ class LineImage(Protocol):
 
 
 @dataclass(frozen=True)
+class TensorImage:
+    """A ``LineImage`` of a tensor ``(lines, width, channels)`` that is in memory already."""
+
+    tensor: Tensor
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """(lines, width, channels)."""
+        lines, width, channels = self.tensor.shape
+        return lines, width, channels
+
+    @property
+    def dtype(self) -> torch.dtype:
+        """The tensor's."""
+        return self.tensor.dtype
+
+    def read(self, start: int, stop: int) -> Tensor:
+        """Lines ``start..stop-1``."""
+        return self.tensor[start:stop]
+
+
+@dataclass(frozen=True)
 class Scan:
     """One pass of an object under the rig: two images, or one image and the depth map a camera computed."""
 
@@ -208,7 +230,11 @@ class Provenance:
 
 @dataclass(frozen=True)
 class Calibration:
-    """The motion of an object under a rig, measured on one or more boards."""
+    """The motion of an object under a rig, measured on one or more boards.
+
+    ``noise_scale`` is how many times larger than the corners' given covariance their residuals are, 1 where they are as
+    expected; the covariance of n allows for it.
+    """
 
     method: CalibrationMethod
     motion: Motion
@@ -219,6 +245,7 @@ class Calibration:
     observability: Observability
     rig: Rig
     converged: bool = True
+    noise_scale: float = 1.0
     provenance: Provenance = field(default_factory=lambda: Provenance("", ""))
 
     @property

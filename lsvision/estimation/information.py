@@ -1,0 +1,61 @@
+"""Fisher information, Cramér-Rao bound, and which directions of a parameter the data weigh more than the prior.
+
+Source: Bar-Shalom, Li & Kirubarajan 2001, Estimation with Applications to Tracking and Navigation, sec. 2.7.
+"""
+
+from collections.abc import Callable
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.func import jacfwd
+
+
+def fisher_information(
+    whitened_residual: Callable[[Tensor], Tensor], state: Float[Tensor, " state"]
+) -> Float[Tensor, "state state"]:
+    """Information Jᵀ J of measurements on a state, J by forward differentiation.
+
+    Args:
+        whitened_residual: takes ``(state,)`` to measured less predicted values in standard deviations, any shape. What
+            is known before the measurements has no part in it.
+    """
+    J = jacfwd(whitened_residual)(state).flatten(0, -2)
+    return J.mT @ J
+
+
+def marginal_information(
+    information: Float[Tensor, "*batch state state"], keep: int
+) -> Float[Tensor, "*batch keep keep"]:
+    """Information on the last ``keep`` components, all others unknown: the Schur complement.
+
+    Raises:
+        torch.linalg.LinAlgError: the others are not determined even where the last are known.
+    """
+    nuisance, cross = information[..., :-keep, :-keep], information[..., :-keep, -keep:]
+    return information[..., -keep:, -keep:] - cross.mT @ torch.linalg.solve(nuisance, cross)
+
+
+def cramer_rao_bound(
+    information: Float[Tensor, "*batch state state"], prior_information: Float[Tensor, "*#batch state state"]
+) -> Float[Tensor, "*batch state state"]:
+    """Smallest covariance that an unbiased estimator can have, given the measurements' and the prior's information."""
+    total = information + prior_information
+    scale = total.diagonal(dim1=-2, dim2=-1).rsqrt()  # mm beside radians: equilibrate before inverting
+    balanced = scale[..., :, None] * total * scale[..., None, :]
+    return scale[..., :, None] * torch.linalg.inv(balanced) * scale[..., None, :]
+
+
+def weighed_directions(
+    information: Float[Tensor, "*batch state state"], prior_sigma: float
+) -> tuple[Float[Tensor, "*batch state state"], Float[Tensor, "*batch state"]]:
+    """Directions in which data and an isotropic prior add up independently, the weakest first.
+
+    Returns:
+        Unit vectors as rows, their largest component positive, and along each the posterior sigma over the prior's: 1
+        where the data say nothing.
+    """
+    weight, columns = torch.linalg.eigh(information * prior_sigma**2)
+    vectors = columns.mT
+    largest = vectors.gather(-1, vectors.abs().argmax(-1, keepdim=True))
+    return vectors * largest.sign(), (1.0 + weight.clamp(min=0.0)).rsqrt()

@@ -1,0 +1,179 @@
+"""What the corners of boards say about the boards' poses and the motion n: the measurement model of the calibration.
+
+The state is x = [θ_1, t_1, .., θ_B, t_B, n]: for each board a rotation vector about a stored nominal rotation R0 and
+the position of its corners' centroid, then n. A corner measured at (x, y, z) with covariance Σ and board point p (from
+the centroid) has the residual
+
+    e = (x, 0, z) + y n - (exp(θ) R0 p + t),      Cov e = M Σ Mᵀ,   M = [e_x | n | e_z].
+
+It is linear in t and n, and only θ needs cubature points. M⁻¹ is ``scan_position``: it turns a displacement of the object
+into one of the measurement. The derivative by n is the predicted travel, not the measured: the noise of y, multiplied by
+an n that the board cannot show, would pass for knowledge of it.
+
+Source: Wang et al. 2024, Eq. 10-18; M generalises its R + σ_y² n nᵀ to noise that is correlated.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from lsvision.estimation import Rows, lower_factor, slr, whitened_rows
+from lsvision.geometry import displace, fit_rigid, rotation_from_vector, scan_position, transform
+
+# Spread, rad and mm, of cubature points that stand for one point: the model there is its tangent to ten digits.
+POINT_SPREAD = 1e-6
+
+
+@dataclass(frozen=True)
+class MountingPitch:
+    """Known angle of a board's normal about the sensor axis, and its standard deviation, rad."""
+
+    angle: float
+    sigma: float
+
+
+@dataclass(frozen=True)
+class BoardProblem:
+    """Measured corners of several boards, and the nominal poses that the state is written about.
+
+    ``points`` are (x, y = travel, z), mm, zero where ``valid`` is false; ``noise_chol`` the Cholesky factor of their
+    covariance; ``body_points`` the board points from the centroid of the valid ones, mm.
+    """
+
+    points: Float[Tensor, "*batch boards corners 3"]
+    noise_chol: Float[Tensor, "*batch boards corners 3 3"]
+    body_points: Float[Tensor, "*batch boards corners 3"]
+    centroid: Float[Tensor, "*batch boards 3"]
+    valid: Bool[Tensor, "*batch boards corners"]
+    rotation: Float[Tensor, "*batch boards 3 3"]
+    pitch: MountingPitch | None = None
+
+    @property
+    def boards(self) -> int:
+        """Number of boards, B; the state has 6 B + 3 components."""
+        return self.points.shape[-3]
+
+
+def nominal_problem(
+    points: Float[Tensor, "*batch boards corners 3"],
+    noise_chol: Float[Tensor, "*batch boards corners 3 3"],
+    board_points: Float[Tensor, "*batch boards corners 3"],
+    valid: Bool[Tensor, "*batch boards corners"],
+    pitch: MountingPitch | None = None,
+) -> tuple[BoardProblem, Float[Tensor, "*batch state"]]:
+    """The problem about the poses that fit best under n = (0, 1, 0), and the state of those poses and that n."""
+    n = points.new_tensor([0.0, 1.0, 0.0])
+    weight = valid.to(points) / valid.sum(-1, keepdim=True)
+    centroid = (weight[..., None] * board_points).sum(-2)
+    body = board_points - centroid[..., None, :]
+    rotation, position = fit_rigid(body, displace(points, n), valid)
+    problem = BoardProblem(points, noise_chol, body, centroid, valid, rotation, pitch)
+    return problem, join_state(torch.zeros_like(position), position, n.expand(*points.shape[:-3], 3))
+
+
+def join_state(
+    theta: Float[Tensor, "*batch boards 3"], position: Float[Tensor, "*batch boards 3"], n: Float[Tensor, "*batch 3"]
+) -> Float[Tensor, "*batch state"]:
+    """State vector of rotation vectors, positions and n."""
+    return torch.cat([torch.cat([theta, position], -1).flatten(-2), n], dim=-1)
+
+
+def split_state(
+    state: Float[Tensor, "*batch state"],
+) -> tuple[Float[Tensor, "*batch boards 3"], Float[Tensor, "*batch boards 3"], Float[Tensor, "*batch 3"]]:
+    """Rotation vectors, positions and n of a state vector."""
+    poses = state[..., :-3].unflatten(-1, (-1, 6))
+    return poses[..., :3], poses[..., 3:], state[..., -3:]
+
+
+def residuals(problem: BoardProblem, state: Float[Tensor, "*#batch state"]) -> Float[Tensor, "*batch boards corners 3"]:
+    """Residuals e of all corners, mm; zero where a corner was not seen."""
+    theta, position, n = split_state(state)
+    rotation = rotation_from_vector(theta) @ problem.rotation
+    predicted = transform(rotation, position, problem.body_points)
+    error = displace(problem.points, n[..., None, None, :]) - predicted
+    return torch.where(problem.valid[..., None], error, 0.0)
+
+
+def whitened_residuals(
+    problem: BoardProblem, state: Float[Tensor, "*#batch state"]
+) -> Float[Tensor, "*batch boards corners 3"]:
+    """Measured less predicted (x, y, z) of all corners in standard deviations, exactly: the likelihood's residuals."""
+    theta, position, n = split_state(state)
+    rotation = rotation_from_vector(theta) @ problem.rotation
+    predicted = scan_position(transform(rotation, position, problem.body_points), n[..., None, None, :])
+    error = torch.linalg.solve_triangular(problem.noise_chol, (problem.points - predicted)[..., None], upper=False)
+    return torch.where(problem.valid[..., None], error[..., 0], 0.0)
+
+
+def linearise(
+    problem: BoardProblem, mean: Float[Tensor, "*batch state"], factor: Float[Tensor, "*batch state columns"]
+) -> Rows:
+    """Whitened rows of all corners about a Gaussian state, at most ten a board (and one of a known mounting pitch).
+
+    The linearisation's errors of different boards are taken as independent.
+    """
+    theta, position, n = split_state(mean)
+    theta_chol = lower_factor(factor[..., :-3, :].unflatten(-2, (problem.boards, 6))[..., :3, :])
+    A, b, error = slr(lambda vector: _turned(problem, vector), theta, theta_chol)
+    turned = ((A @ theta[..., None])[..., 0] + b).unflatten(-1, (-1, 3))
+    predicted = scan_position(turned + position[..., None, :], n[..., None, None, :])
+    residual = displace(problem.points - predicted, n[..., None, None, :])
+    eye = torch.eye(3, dtype=mean.dtype, device=mean.device).expand(*residual.shape, 3)
+    by_n = predicted[..., 1, None, None] * eye
+    columns = torch.cat([-A.unflatten(-2, (-1, 3)), -eye, by_n, error.unflatten(-2, (-1, 3)), -residual[..., None]], -1)
+    columns = scan_position(columns.mT, n[..., None, None, None, :]).mT
+    rows = whitened_rows(columns[..., :9], columns[..., 12], columns[..., 9:12], problem.noise_chol, problem.valid)
+    by_motion = 2 * problem.valid.sum((-2, -1)) * n[..., 1].abs().log()
+    joined = _scatter(rows.matrix)
+    if problem.pitch is not None:
+        joined = torch.cat([joined, _pitch_row(problem, problem.pitch, theta, theta_chol)], dim=-2)
+    return Rows(joined, rows.log_det.sum(-1) + by_motion)
+
+
+def motion_information(problem: BoardProblem, state: Float[Tensor, "*batch state"]) -> Float[Tensor, "*batch 3 3"]:
+    """Fisher information of the corners on n, the poses being unknown; without any prior on n or on the poses."""
+    size = state.shape[-1]
+    spread = POINT_SPREAD * torch.eye(size, dtype=state.dtype, device=state.device)
+    rows = linearise(problem, state, spread.expand(*state.shape, size)).matrix[..., :-1]
+    root = torch.linalg.qr(rows, mode="r").R[..., -3:, -3:]
+    return root.mT @ root
+
+
+def rotations(problem: BoardProblem, state: Float[Tensor, "*batch state"]) -> Float[Tensor, "*batch boards 3 3"]:
+    """Rotations of the boards, exp(θ) R0."""
+    return rotation_from_vector(split_state(state)[0]) @ problem.rotation
+
+
+def translations(problem: BoardProblem, state: Float[Tensor, "*batch state"]) -> Float[Tensor, "*batch boards 3"]:
+    """Translations T of the boards, mm: where the board frames' origins lie."""
+    position = split_state(state)[1]
+    return position - (rotations(problem, state) @ problem.centroid[..., None])[..., 0]
+
+
+def _turned(problem: BoardProblem, theta: Tensor) -> Tensor:
+    """Board points turned by exp(theta) R0, ``(points, *batch, boards, 3 corners)``, at cubature points of theta."""
+    return (problem.body_points @ (rotation_from_vector(theta) @ problem.rotation).mT).flatten(-2)
+
+
+def _scatter(matrix: Tensor) -> Tensor:
+    """Rows of each board's own nine unknowns, ``(*batch, boards, rows, 10)``, as rows of the whole state's."""
+    boards = matrix.shape[-3]
+    own = torch.eye(boards, dtype=matrix.dtype, device=matrix.device)[:, None, :, None]
+    poses = (own * matrix[..., None, :6]).flatten(-2)
+    return torch.cat([poses, matrix[..., 6:]], dim=-1).flatten(-3, -2)
+
+
+def _pitch_row(problem: BoardProblem, pitch: MountingPitch, theta: Tensor, theta_chol: Tensor) -> Tensor:
+    """The one whitened row of a known mounting pitch of a single board, whose theta comes first in the state."""
+
+    def angle(vector: Tensor) -> Tensor:
+        normal = (rotation_from_vector(vector) @ problem.rotation)[..., 2]
+        return torch.atan2(-normal[..., 1], normal[..., 2])[..., None]
+
+    A, b, _ = slr(angle, theta, theta_chol)
+    expected = (A @ theta[..., None])[..., 0] + b
+    row = torch.cat([A[..., 0, :], A.new_zeros(*A.shape[:-2], 6), pitch.angle - expected], dim=-1)
+    return row / pitch.sigma

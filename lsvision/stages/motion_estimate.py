@@ -1,0 +1,134 @@
+"""Methods that estimate board poses and the motion n from corners: each takes a problem and its start to a posterior.
+
+All methods hold the prior on n (and on the poses, where one is wanted) fixed and count every corner once.
+"""
+
+import math
+from dataclasses import dataclass
+from functools import partial
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from lsvision.estimation import Info, Posterior, Rows, iterated_update
+from lsvision.estimation.joint import Linearise
+from lsvision.stages.board_model import POINT_SPREAD, BoardProblem, linearise, residuals
+from lsvision.types import CalibrationMethod
+
+
+@dataclass(frozen=True)
+class CalibrationConfig:
+    """How the motion is estimated from the corners.
+
+    ``joint`` is the iterated update over all corners of all boards; ``two_step`` alternates poses and n as the paper
+    does; ``sequential`` filters corner by corner in line order; ``least_squares`` is the maximum of the posterior by
+    Levenberg-Marquardt. The poses' prior lies around the poses that fit best under n = (0, 1, 0); infinite sigmas make
+    it flat, so that no corner counts twice.
+    """
+
+    method: CalibrationMethod = "joint"
+    prior_sigma: float = 0.05  # of each component of n about (0, 1, 0)
+    rotation_sigma_rad: float = math.inf
+    translation_sigma_mm: float = math.inf
+    max_iterations: int = 20
+    tolerance: float = 1e-9  # Kullback-Leibler divergence between two iterates, nats
+    two_step_threshold_mm: float = 0.05  # RMSE below which Alg. 1 ends
+    two_step_max_iterations: int = 20
+    process_sigma: float = 0.0  # of the random walk of n per square root of a mm travelled; sequential only
+    mounting_pitch_deg: float | None = None  # known angle of a single board's normal about the sensor axis
+    mounting_pitch_sigma_deg: float = 0.1
+
+
+def estimate(problem: BoardProblem, start: Float[Tensor, "*batch state"], config: CalibrationConfig) -> Posterior:
+    """Posterior of the poses and n by the configured method."""
+    methods = {"joint": joint, "two_step": two_step}
+    return methods[config.method](problem, start, config)
+
+
+def joint(problem: BoardProblem, start: Float[Tensor, "*batch state"], config: CalibrationConfig) -> Posterior:
+    """Iterated posterior linearisation over all corners of all boards at once."""
+    return iterated_update(
+        partial(linearise, problem),
+        start,
+        prior_root(start, config),
+        start,
+        _point(start),
+        max_iterations=config.max_iterations,
+        tolerance=config.tolerance,
+    )
+
+
+def two_step(problem: BoardProblem, start: Float[Tensor, "*batch state"], config: CalibrationConfig) -> Posterior:
+    """Alternate the boards' poses given n (Step-I) and n given the poses (Step-II) until the RMSE is small enough.
+
+    The covariance is that of all unknowns together at the result: Step-II's own, with the poses held fixed, would claim
+    directions of n that the boards cannot show.
+
+    Source: Wang et al. 2024, Algorithm 1; its step 8 is printed with the inequality the wrong way round.
+    """
+    poses, motion = slice(0, start.shape[-1] - 3), slice(start.shape[-1] - 3, start.shape[-1])
+    state, path = start, [start]
+    running = rmse(problem, start) > config.two_step_threshold_mm
+    iterations = torch.zeros_like(running, dtype=torch.long)
+    for _ in range(config.two_step_max_iterations):
+        if not bool(running.any()):
+            break
+        after_poses = _update_part(problem, state, start, poses, config)
+        after_motion = _update_part(problem, after_poses, start, motion, config)
+        state = torch.where(running[..., None], after_motion, state)
+        path.append(state)
+        iterations = iterations + running
+        running = running & (rmse(problem, state) > config.two_step_threshold_mm)
+    factor = _joint_factor(problem, state, prior_root(start, config))
+    info = torch.where(running, int(Info.NOT_CONVERGED), int(Info.OK))
+    info = torch.where(torch.isfinite(factor).all((-2, -1)) & torch.isfinite(state).all(-1), info, int(Info.SINGULAR))
+    return Posterior(state, factor, torch.stack(path), iterations, info == int(Info.OK), info)
+
+
+def prior_root(start: Float[Tensor, "*batch state"], config: CalibrationConfig) -> Float[Tensor, "*batch state state"]:
+    """Information root of the prior: diagonal, zero for what is flat."""
+    boards = (start.shape[-1] - 3) // 6
+    pose = [1 / config.rotation_sigma_rad] * 3 + [1 / config.translation_sigma_mm] * 3
+    diagonal = start.new_tensor(pose * boards + [1 / config.prior_sigma] * 3)
+    return torch.diag(diagonal).expand(*start.shape, start.shape[-1])
+
+
+def rmse(problem: BoardProblem, state: Float[Tensor, "*#batch state"]) -> Float[Tensor, "*batch"]:
+    """Root-mean-square residual over all corners of all boards, mm."""
+    squared = residuals(problem, state).square().sum((-3, -2, -1))
+    return (squared / problem.valid.sum((-2, -1))).sqrt()
+
+
+def _update_part(problem: BoardProblem, state: Tensor, start: Tensor, part: slice, config: CalibrationConfig) -> Tensor:
+    """The state with one part of it updated by all corners, the rest held; the prior is that of the start."""
+    root = prior_root(start, config)[..., part, part]
+    held = _given_rest(problem, state, part)
+    mean, spread = state[..., part], _point(state)[..., part, part]
+    posterior = iterated_update(
+        held, start[..., part], root, mean, spread, max_iterations=config.max_iterations, tolerance=config.tolerance
+    )
+    return torch.cat([state[..., : part.start], posterior.mean, state[..., part.stop :]], dim=-1)
+
+
+def _given_rest(problem: BoardProblem, state: Tensor, part: slice) -> Linearise:
+    """Linearisation in one part of the state, the rest known to be what it is."""
+
+    def rows(mean: Tensor, factor: Tensor) -> Rows:
+        full, spread = state.clone(), _point(state).clone()
+        full[..., part], spread[..., part, part] = mean, factor
+        whole = linearise(problem, full, spread)
+        return Rows(torch.cat([whole.matrix[..., part], whole.matrix[..., -1:]], -1), whole.log_det)
+
+    return rows
+
+
+def _joint_factor(problem: BoardProblem, state: Tensor, root: Tensor) -> Tensor:
+    """Covariance factor of all unknowns, the model linearised at a point."""
+    return iterated_update(partial(linearise, problem), state, root, state, _point(state), max_iterations=1).factor
+
+
+def _point(state: Tensor) -> Tensor:
+    """Factor of a Gaussian so narrow that linearising about it is linearising at its mean."""
+    eye = torch.eye(state.shape[-1], dtype=state.dtype, device=state.device)
+    return (POINT_SPREAD * eye).expand(*state.shape, state.shape[-1])
