@@ -64,7 +64,7 @@ def triangulate_general(
     baseline_mm: float,
     alpha: float,
     beta: float,
-) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch"], Bool[Tensor, "*batch"]]:
+) -> tuple[Float[Tensor, "*batch 2"], Float[Tensor, "*batch"], Bool[Tensor, "*batch"]]:
     """Intersect the rays of two line cameras whose axes lie in one plane at any angle.
 
     The left centre is the origin, X points along the baseline to the right centre, Z into the scene. Angles grow

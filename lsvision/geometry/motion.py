@@ -72,7 +72,7 @@ def travel_at(travel: Travel, line: Float[Tensor, "*batch"]) -> Float[Tensor, "*
     log = _checked_log(travel.positions_mm).to(line)
     if log.numel() == 1:
         return sign * (log[0] + travel.line_pitch_mm * line)
-    base = line.detach().floor().clamp(0, log.numel() - 2).long()
+    base = line.detach().nan_to_num().floor().clamp(0, log.numel() - 2).long()  # a NaN stays one by its weight
     inside = torch.lerp(log[base], log[base + 1], (line - base).clamp(0, 1))
     beyond = line.clamp(max=0) + (line - (log.numel() - 1)).clamp(min=0)
     return sign * (inside + travel.line_pitch_mm * beyond)

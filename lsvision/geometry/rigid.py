@@ -65,20 +65,21 @@ def fit_rigid(
         source, target: corresponding points, mm. Points with ``valid`` false may be NaN.
 
     Returns:
-        R (proper rotation) and T, mm.
+        R (proper rotation) and T, mm; NaN where no point is valid.
 
     Source: Kabsch 1976; Umeyama 1991, Eq. 40-43.
     """
-    source, target = torch.broadcast_tensors(source, target)
-    weight = torch.ones_like(source[..., 0]) if valid is None else valid.expand(source.shape[:-1]).to(source)
-    weight = (weight / weight.sum(-1, keepdim=True))[..., None]
+    weight = source.new_ones(1) if valid is None else valid.to(source)
+    source, target, weight = torch.broadcast_tensors(source, target, weight[..., None])
+    seen = weight.sum(-2)
+    weight = weight / seen[..., None, :].clamp(min=1)
     source, target = (torch.where(weight > 0, points, 0.0) for points in (source, target))
     source_mean, target_mean = (weight * source).sum(-2), (weight * target).sum(-2)
     covariance = (weight * (target - target_mean[..., None, :])).mT @ (source - source_mean[..., None, :])
     u, _, vh = torch.linalg.svd(covariance)
     sign = torch.ones_like(u[..., 0])
     sign[..., 2] = torch.linalg.det(u @ vh).sign()
-    rotation = (u * sign[..., None, :]) @ vh
+    rotation = torch.where(seen[..., :1, None] > 0, (u * sign[..., None, :]) @ vh, torch.nan)
     return rotation, target_mean - (rotation @ source_mean[..., None])[..., 0]
 
 

@@ -55,7 +55,9 @@ def make_scan(tmp_path: Path, small_rig: Rig, images) -> Callable[..., Path]:
 def calibration(small_rig: Rig) -> Calibration:
     n = torch.tensor([-0.0257, 0.9845, 0.1 + 0.2], dtype=torch.float64)
     root = torch.randn(3, 3, dtype=torch.float64) * 1e-4
-    board = BoardFit("scans/Tür 1", 88, torch.eye(3).double(), torch.tensor([1.0, 2.0, 797.3]).double(), 2.1, 0.05)
+    board = BoardFit(
+        "scans/Tür 1", 88, torch.eye(3).double(), torch.tensor([1.0, 2.0, 797.3], dtype=torch.float64), 2.1, 0.05
+    )
     direction = ObservedDirection((0.0, 0.6, 0.8), 0.05, 2.5e-5, True)
     return Calibration(
         method="joint",

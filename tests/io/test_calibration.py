@@ -34,14 +34,14 @@ def test_round_trip_is_exact(tmp_path: Path, calibration: Calibration) -> None:
     variances=st.lists(st.floats(0, 1), min_size=3, max_size=3),
 )
 def test_any_motion_round_trips(tmp_path: Path, calibration: Calibration, n: tuple, variances: list) -> None:
-    motion = Motion(torch.tensor(n).double(), torch.tensor(variances).double().diag())
+    motion = Motion(torch.tensor(n, dtype=torch.float64), torch.tensor(variances, dtype=torch.float64).diag())
     write_calibration(replace(calibration, motion=motion), tmp_path / "calibration.json")
     assert plain(read_calibration(tmp_path / "calibration.json").motion) == plain(motion)
 
 
 def test_file_has_the_documented_keys(tmp_path: Path, calibration: Calibration) -> None:
     motion = Motion(
-        torch.tensor([0.1, 1.0, -0.2]).double(), torch.diag(torch.tensor([4.0, 9.0, 16.0])).double() * 1e-10
+        torch.tensor([0.1, 1.0, -0.2], dtype=torch.float64), torch.diag(torch.tensor([4.0, 9.0, 16.0])).double() * 1e-10
     )
     write_calibration(replace(calibration, motion=motion), tmp_path / "calibration.json")
     data = json.loads((tmp_path / "calibration.json").read_text())
