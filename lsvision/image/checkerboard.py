@@ -66,7 +66,9 @@ def reduce_image(image: LineImage, factor: int) -> Float[Tensor, "lines width"]:
     return torch.cat(blocks) if blocks else torch.zeros(0, kept // factor)
 
 
-def find_grid(brightness: Float[Tensor, "lines width"], inner: tuple[int, int]) -> Float[Tensor, "rows columns 2"] | None:
+def find_grid(
+    brightness: Float[Tensor, "lines width"], inner: tuple[int, int]
+) -> Float[Tensor, "rows columns 2"] | None:
     """Inner corners of a board as a grid of (u, v) px, columns along the longer side; None where none is seen.
 
     The order along either side, and so the handedness, is left open: ``order_grid`` settles it.

@@ -15,8 +15,8 @@ def sample_image(
 ) -> Tensor:
     """Sample an image ``(lines, width, channels)`` at positions in px; ``(rows, columns, channels)`` of its dtype.
 
-    Positions are relative to the image's first line, so that float32 holds them to 1e-4 px. Those outside are clamped to
-    the rim; NaN positions give 0.
+    Positions are relative to the image's first line, so that float32 holds them to 1e-4 px. Those outside are clamped
+    to the rim; NaN positions give 0.
     """
     lines, width, _ = image.shape
     known = torch.isfinite(column) & torch.isfinite(line)

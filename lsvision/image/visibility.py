@@ -40,7 +40,8 @@ def visible_segments(
     bids = offset < count[..., None]
     cell = torch.where(bids, first[..., None].long() + offset, cells).flatten(1)
     fraction = ((first[..., None] + offset - low[..., None]) / (high - low)[..., None]).flatten(1)
-    bid_depth = torch.lerp(*(d[..., None].expand(bids.shape).flatten(1) for d in (depth[:, :-1], depth[:, 1:])), fraction)
+    begin, end = (side[..., None].expand(bids.shape).flatten(1) for side in (depth[:, :-1], depth[:, 1:]))
+    bid_depth = torch.lerp(begin, end, fraction)
     bid_depth = torch.where(bids.flatten(1), bid_depth, torch.inf)
     nearest = torch.full((lines, cells + 1), torch.inf, dtype=depth.dtype, device=depth.device)
     nearest.scatter_reduce_(1, cell, bid_depth, "amin")
@@ -53,8 +54,8 @@ def visible_segments(
     segment = padded[:, :cells]
     start = segment.clamp(min=0)
     axis = torch.arange(cells, dtype=position.dtype, device=position.device)
-    begin, end = position.gather(1, start), position.gather(1, start + 1)
-    return segment, torch.where(segment >= 0, (axis - begin) / (end - begin), 0.0)
+    before, after = position.gather(1, start), position.gather(1, start + 1)
+    return segment, torch.where(segment >= 0, (axis - before) / (after - before), 0.0)
 
 
 def interpolate_segments(

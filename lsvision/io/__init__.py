@@ -1,6 +1,8 @@
 """Files: rig, scan, calibration and product; read by line ranges, checked on reading, complete under a final name."""
 
+from lsvision.io.atomic import write_text
 from lsvision.io.calibration import check_rig_match, read_calibration, write_calibration
+from lsvision.io.checksum import scan_sha256
 from lsvision.io.encoder import read_encoder, write_encoder
 from lsvision.io.line_image import open_line_image
 from lsvision.io.ply import write_ply
@@ -21,10 +23,12 @@ __all__ = [
     "read_scan",
     "rig_from_dict",
     "rig_to_dict",
+    "scan_sha256",
     "write_calibration",
     "write_encoder",
     "write_line_image",
     "write_ply",
     "write_rig",
     "write_scan",
+    "write_text",
 ]

@@ -8,6 +8,7 @@ from torch import Tensor
 from lsvision.errors import BoardNotFoundError
 from lsvision.geometry import travel_at, triangulate, triangulation_jacobian
 from lsvision.image.checkerboard import DetectedCorners, detect_board
+from lsvision.image.planes import fit_local_planes
 from lsvision.types import Board, BoardCorners, LineImage, Scan, Travel
 
 
@@ -63,9 +64,7 @@ def find_corners(scan: Scan, board: Board, config: CornersConfig | None = None) 
 def _detect(scan: Scan, image: LineImage, side: str, board: Board) -> DetectedCorners:
     detected = detect_board(image, board, mirrored=scan.travel.transport == "reverse")
     if detected is None:
-        raise BoardNotFoundError(
-            f"{scan.path}: no board of {board.columns} x {board.rows} squares in the {side} image"
-        )
+        raise BoardNotFoundError(f"{scan.path}: no board of {board.columns} x {board.rows} squares in the {side} image")
     return detected
 
 
@@ -106,7 +105,7 @@ def _from_depth_map(
     pitch = _pitch_at(scan.travel, left.position[:, 1])
     half_columns = max(2, round(config.depth_window_mm / 2 / scan.rig.object_pitch_mm))
     half_lines = max(2, round(config.depth_window_mm / 2 / abs(scan.travel.line_pitch_mm)))
-    z, variance, seen = _plane_depth(depth, left.position, left.valid, half_columns, half_lines)
+    z, variance, seen = fit_local_planes(depth, left.position, left.valid, (half_columns, half_lines))
     slope = (left.position[:, 0] - scan.rig.principal_left_px) / scan.rig.focal_length_px
     points = torch.stack([slope * z, travel_at(scan.travel, left.position[:, 1]), z], dim=-1)
     zero, one = torch.zeros_like(z), torch.ones_like(z)
@@ -116,40 +115,6 @@ def _from_depth_map(
     by_depth = torch.stack([slope, zero, one], -1)[..., None]
     covariance = by_pixel @ left.covariance @ by_pixel.mT + by_depth @ by_depth.mT * variance[:, None, None]
     return points, covariance, left.valid & seen
-
-
-def _plane_depth(
-    depth: LineImage, position: Tensor, wanted: Tensor, half_columns: int, half_lines: int
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Depth at positions by least squares on a plane, twice: the second time without what lies off the first."""
-    lines, width, _ = depth.shape
-    safe = torch.where(wanted[:, None], position, 0.0)
-    centre = safe.round().long()
-    du, dv = torch.meshgrid(
-        torch.arange(-half_columns, half_columns + 1), torch.arange(-half_lines, half_lines + 1), indexing="xy"
-    )
-    first, last = int(centre[:, 1].min()) - half_lines, int(centre[:, 1].max()) + half_lines + 1
-    first, last = max(first, 0), min(last, lines)
-    strip = depth.read(first, last)[..., 0].to(torch.float64)
-    column, line = centre[:, 0, None, None] + du, centre[:, 1, None, None] + dv
-    inside = (column >= 0) & (column < width) & (line >= first) & (line < last)
-    values = strip[(line.clamp(first, last - 1) - first), column.clamp(0, width - 1)].flatten(1)
-    usable = inside.flatten(1) & torch.isfinite(values)
-    values = torch.where(usable, values, 0.0)
-    offset = torch.stack([column - safe[:, 0, None, None], line - safe[:, 1, None, None]], dim=-1).flatten(1, 2)
-    design = torch.cat([torch.ones_like(offset[..., :1]), offset], dim=-1)
-    weight = usable.to(torch.float64)
-    for _ in range(2):
-        normal = design.mT @ (weight[..., None] * design) + 1e-9 * torch.eye(3, dtype=torch.float64)
-        plane = torch.linalg.solve(normal, (design.mT @ (weight * values)[..., None]))
-        residual = torch.where(usable, values - (design @ plane)[..., 0], torch.inf).abs()
-        spread = torch.where(usable, residual, torch.nan).nanmedian(-1, keepdim=True).values
-        weight = (residual <= 4.5 * spread + 1e-9).to(torch.float64)  # three sigmas of a normal distribution
-    count = weight.sum(-1)
-    variance = (weight * torch.where(usable, residual, 0.0).square()).sum(-1) / (count - 3).clamp(min=1)
-    variance = variance * torch.linalg.inv(normal)[:, 0, 0]
-    # A plane through less than a quarter of the window says little about the corner.
-    return plane[:, 0, 0], variance, wanted & (count >= 0.25 * design.shape[1])
 
 
 def _pitch_at(travel: Travel, line: Tensor) -> Tensor:

@@ -23,10 +23,11 @@ from lsvision.types import LineImage, Motion, Rig, Scan
 class CorrectionConfig:
     """How a scan becomes a product.
 
-    ``pitch_mm`` is the side of a product's cell; the scan's own line pitch where it is None. ``strip_rows`` are computed
-    at once. A surface counts as continuous between neighbours whose disparities differ by at most ``step_px``: at one
-    pixel it is so steep that one of the cameras no longer sees it. Holes of up to ``bridge_px`` samples are bridged for
-    colour; their height stays invalid. ``height_range_mm`` bounds what a strip looks for; it costs nothing to be wide.
+    ``pitch_mm`` is the side of a product's cell; the scan's own line pitch where it is None. ``strip_rows`` are
+    computed at once. A surface counts as continuous between neighbours whose disparities differ by at most ``step_px``:
+    at one pixel it is so steep that one of the cameras no longer sees it. Holes of up to ``bridge_px`` samples are
+    bridged for colour; their height stays invalid. ``height_range_mm`` bounds what a strip looks for; it costs nothing
+    to be wide.
     """
 
     pitch_mm: float | None = None
@@ -52,9 +53,9 @@ class ProductGrid:
 class ProductStrip:
     """Consecutive rows of a product.
 
-    ``color (rows, columns, channels)`` in the scan's dtype, ``height (rows, columns)`` float32 mm over the plane of zero
-    disparity, NaN where not measured, ``valid`` where it is, ``source (rows, columns, 2)`` float32 (line, column) that
-    the colour came from, NaN where nothing was seen.
+    ``color (rows, columns, channels)`` in the scan's dtype, ``height (rows, columns)`` float32 mm over the plane of
+    zero disparity, NaN where not measured, ``valid`` where it is, ``source (rows, columns, 2)`` float32 (line, column)
+    that the colour came from, NaN where nothing was seen.
     """
 
     row: int
@@ -120,9 +121,15 @@ def correct_rows(
 
 
 def _locate(
-    z: Tensor, scan: Scan, motion: Motion, config: CorrectionConfig, grid: ProductGrid, rows: tuple[int, int], start: int
+    z: Tensor,
+    scan: Scan,
+    motion: Motion,
+    config: CorrectionConfig,
+    grid: ProductGrid,
+    rows: tuple[int, int],
+    start: int,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Column, line and q_z, ``(rows, columns)`` float64, of the surface seen by each cell, and whether it was measured."""
+    """Column, line and q_z, ``(rows, columns)`` float64, of the surface each cell sees, and whether it was measured."""
     rig, axes = scan.rig, product_axes(motion.n)
     limit = config.step_px * rig.zero_disparity_mm**2 / (rig.focal_length_px * rig.baseline_mm)
     measured = torch.isfinite(z)

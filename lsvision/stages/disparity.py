@@ -9,7 +9,9 @@ import torch
 from torch import Tensor
 
 from lsvision.geometry import triangulate
+from lsvision.image.checkerboard import gray
 from lsvision.image.matching import match_sgbm
+from lsvision.image.refinement import refine_disparity
 from lsvision.types import LineImage, Rig, Scan
 
 
@@ -19,8 +21,9 @@ class DisparityConfig:
 
     The search range is given in heights over the plane of zero disparity, mm, positive towards the cameras: -26.9..25.2
     is -165..+165 px on the full 3DPIXA and the same 52 mm on any other rig. ``lambda1`` and ``lambda2`` penalise a
-    change of disparity by one and by more, per pixel of the block. ``strip_lines`` are matched at once, with
-    ``halo_lines`` beyond either end that are thrown away.
+    change of disparity by one and by more, per pixel of the block. ``refine_iterations`` of local least squares over a
+    window of ``refine_window`` px follow; 0 leaves the matcher's own sixteenths of a pixel, which lean towards whole
+    ones. ``strip_lines`` are matched at once, with ``halo_lines`` beyond either end that are thrown away.
     """
 
     matcher: Literal["sgbm"] = "sgbm"
@@ -31,6 +34,9 @@ class DisparityConfig:
     left_right_check_px: int = 10
     uniqueness_percent: int = 5
     speckle_px: int = 100
+    refine_iterations: int = 2
+    refine_window: int = 9
+    refine_noise: float = 2.0  # grey values, of 255
     strip_lines: int = 512
     halo_lines: int = 24
 
@@ -38,16 +44,15 @@ class DisparityConfig:
 def disparity_range(rig: Rig, config: DisparityConfig) -> tuple[int, int]:
     """Lowest and highest disparity, px, that the configured heights ask for on a rig."""
     convergence = rig.principal_right_px - rig.principal_left_px
-    low, high = (
-        convergence * (rig.zero_disparity_mm / (rig.zero_disparity_mm - height) - 1) for height in config.height_range_mm
-    )
+    z0 = rig.zero_disparity_mm
+    low, high = (convergence * (z0 / (z0 - height) - 1) for height in config.height_range_mm)
     return math.floor(low), math.ceil(high)
 
 
 def match_strip(left: Tensor, right: Tensor, rig: Rig, config: DisparityConfig) -> Tensor:
     """Disparity, px, of a pair of strips ``(lines, width, channels)``; NaN where there is no match."""
     minimum_px, maximum_px = disparity_range(rig, config)
-    return match_sgbm(
+    disparity = match_sgbm(
         left,
         right,
         minimum_px=minimum_px,
@@ -58,6 +63,18 @@ def match_strip(left: Tensor, right: Tensor, rig: Rig, config: DisparityConfig) 
         left_right_check_px=config.left_right_check_px,
         uniqueness_percent=config.uniqueness_percent,
         speckle_px=config.speckle_px,
+    )
+    if config.refine_iterations == 0:
+        return disparity
+    # 16-bit images are brought to the scale on which the noise is given.
+    scale = 1.0 if left.dtype == torch.uint8 else 1.0 / 257.0
+    return refine_disparity(
+        gray(left) * scale,
+        gray(right) * scale,
+        disparity,
+        window=config.refine_window,
+        iterations=config.refine_iterations,
+        noise=config.refine_noise,
     )
 
 

@@ -1,0 +1,19 @@
+"""The experiments a run can choose: each reads, calls stages, and writes."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from lsvision.experiments.calibrate import CalibrateSettings, run_calibrate
+from lsvision.experiments.correct import CorrectSettings, run_correct
+from lsvision.experiments.paper import PaperSettings, run_paper
+from lsvision.experiments.settings import RunSettings
+from lsvision.experiments.simulate import SimulateSettings, run_simulate
+
+# By name: the function and the schema of its options.
+EXPERIMENTS: dict[str, tuple[Callable[[Any, Path], None], type[RunSettings]]] = {
+    "paper": (run_paper, PaperSettings),
+    "simulate": (run_simulate, SimulateSettings),
+    "calibrate": (run_calibrate, CalibrateSettings),
+    "correct": (run_correct, CorrectSettings),
+}

@@ -1,0 +1,73 @@
+"""``+experiment=calibrate``: boards' scans -> corners -> calibration.json and a report."""
+
+import logging
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+from lsvision import __version__
+from lsvision.errors import CalibrationError, ConfigError
+from lsvision.experiments.progress import progress_bars
+from lsvision.experiments.settings import RunSettings, settings_sha256
+from lsvision.io import read_scan, scan_sha256, write_calibration
+from lsvision.report import calibration_report, calibration_summary
+from lsvision.stages.calibration import CalibrationConfig, calibrate
+from lsvision.stages.corners import CornersConfig, find_corners
+from lsvision.types import Board, BoardCorners, Provenance, Scan
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, kw_only=True)
+class CalibrateSettings(RunSettings):
+    """Options of the experiment; ``output`` is the file to write, ``calibration.json`` in the run's folder if None."""
+
+    scans: list[str]
+    board: Board
+    corners: CornersConfig
+    calibration: CalibrationConfig
+    output: str | None = None
+
+
+def run_calibrate(settings: CalibrateSettings, folder: Path) -> None:
+    """Find the board in every scan, calibrate, write the result and its report."""
+    scans = read_scans(settings.scans)
+    boards = find_boards(scans, settings.board, settings.corners)
+    calibration = calibrate(boards, scans[0].rig, settings.calibration)
+    provenance = Provenance(
+        version=__version__,
+        config_sha256=settings_sha256(settings),
+        scans=tuple((str(scan.path), scan_sha256(scan.path)) for scan in scans),
+    )
+    calibration = replace(calibration, provenance=provenance)
+    target = Path(settings.output) if settings.output else folder / "calibration.json"
+    write_calibration(calibration, target)
+    calibration_report(calibration, boards, asdict(settings), folder)
+    log.info("%s\nwrote %s and %s", calibration_summary(calibration), target, folder / "report.html")
+
+
+def read_scans(paths: Sequence[str]) -> list[Scan]:
+    """Open scans that were taken with one rig.
+
+    Raises:
+        ConfigError: the list is empty.
+        CalibrationError: two scans have different rigs.
+    """
+    if not paths:
+        raise ConfigError("scans: the list is empty; give at least one scan folder, scans=[DIR,DIR,...]")
+    scans = [read_scan(path) for path in paths]
+    for scan in scans[1:]:
+        if scan.rig != scans[0].rig:
+            raise CalibrationError(f"{scan.path}: another rig than {scans[0].path}; calibrate them apart")
+    return scans
+
+
+def find_boards(scans: Sequence[Scan], board: Board, config: CornersConfig) -> list[BoardCorners]:
+    """Corners of the board in every scan."""
+    found = []
+    with progress_bars() as bars:
+        bar = bars.start("find corners", total=len(scans))
+        for scan in scans:
+            found.append(find_corners(scan, board, config))
+            bars.advance(bar)
+    return found

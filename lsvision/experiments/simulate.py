@@ -1,0 +1,98 @@
+"""``+experiment=simulate``: render a scan folder with its truth."""
+
+import logging
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from lsvision.errors import ConfigError
+from lsvision.experiments.progress import ProgressBars, progress_bars
+from lsvision.experiments.settings import RunSettings
+from lsvision.io import write_scan
+from lsvision.simulation import (
+    EncoderConfig,
+    MotionConfig,
+    SceneConfig,
+    SensorConfig,
+    Simulation,
+    scaled_rig,
+    simulate,
+)
+from lsvision.types import Board, Rig, Transport
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SimulateSettings(RunSettings):
+    """Options of the experiment.
+
+    ``scale`` = 4 means a quarter of the pixels at four times the pitch. ``lines`` is as many as the target needs where
+    it is None. ``output`` is the scan folder to write, ``scan`` in the run's folder where it is None. With ``depth``
+    the scan has the true depth map of the left image in place of the right image, as a camera with a matcher of its
+    own writes.
+    """
+
+    rig: Rig
+    board: Board
+    scene: SceneConfig
+    motion: MotionConfig
+    sensor: SensorConfig
+    encoder: EncoderConfig
+    scale: float = 4.0
+    line_pitch_mm: float = 0.07
+    lines: int | None = None
+    transport: Transport = "forward"
+    depth: bool = False
+    strip_lines: int = 256
+    output: str | None = None
+
+
+def run_simulate(settings: SimulateSettings, folder: Path) -> None:
+    """Render the scene and write it as a scan folder."""
+    if settings.scale < 1:
+        raise ConfigError(f"scale: expected at least 1 (the full camera), got {settings.scale}")
+    simulation = simulate(
+        scaled_rig(settings.rig, settings.scale),
+        settings.board,
+        settings.scene,
+        settings.motion,
+        settings.sensor,
+        settings.line_pitch_mm * settings.scale,
+        lines=settings.lines,
+        transport=settings.transport,
+        encoder=settings.encoder,
+    )
+    target = Path(settings.output) if settings.output else folder / "scan"
+    with progress_bars() as bars:
+        write_simulation(simulation, target, bars, depth=settings.depth, strip_lines=settings.strip_lines)
+    log.info("wrote %s: %d lines of %d px, %s", target, simulation.lines, simulation.rig.width_px, settings.scene.kind)
+
+
+def write_simulation(
+    simulation: Simulation, target: Path, bars: ProgressBars, *, depth: bool = False, strip_lines: int = 256
+) -> None:
+    """Write a simulated scan with its ``truth.json``; with ``depth`` the true depth map in place of the right image."""
+    bar = bars.start(f"render {target.name}", total=2 * simulation.lines)
+
+    def counted(strips: Iterator[Tensor]) -> Iterator[Tensor]:
+        for strip in strips:
+            yield strip
+            bars.advance(bar, strip.shape[0])
+
+    write_scan(
+        target,
+        rig=simulation.rig,
+        travel=simulation.travel,
+        left=counted(simulation.strips("left", strip_lines)),
+        right=None if depth else counted(simulation.strips("right", strip_lines)),
+        depth=counted(strip[..., None] for strip in simulation.depth_strips(strip_lines)) if depth else None,
+        lines=simulation.lines,
+        channels=simulation.channels,
+        dtype=torch.uint16 if simulation.sensor.bits == 16 else torch.uint8,
+        color_registered=simulation.sensor.color_registered,
+        extra_json={"truth.json": simulation.truth()},
+    )

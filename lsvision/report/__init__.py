@@ -1,0 +1,15 @@
+"""Figures, the self-contained HTML report and the summary in words."""
+
+from lsvision.report.experiment_pages import calibration_report, product_report
+from lsvision.report.pages import Comparison, ReportFigure, Table, write_report
+from lsvision.report.summary import calibration_summary
+
+__all__ = [
+    "Comparison",
+    "ReportFigure",
+    "Table",
+    "calibration_report",
+    "calibration_summary",
+    "product_report",
+    "write_report",
+]

@@ -1,0 +1,83 @@
+"""Reports of a calibration and of a product."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+
+from lsvision.io import Product
+from lsvision.report.calibration_figures import (
+    components_by_iteration,
+    corner_positions,
+    observability_bars,
+    rmse_by_iteration,
+    stretch_by_iteration,
+)
+from lsvision.report.pages import Comparison, ReportFigure, Table, write_report
+from lsvision.report.product_figures import product_images
+from lsvision.report.summary import calibration_summary
+from lsvision.types import BoardCorners, Calibration
+
+_SHOWN_ROWS = 4000  # of a product, from its start: enough for a look, little enough for any length of scan
+
+
+def calibration_report(calibration: Calibration, boards: Sequence[BoardCorners], settings: dict, folder: Path) -> None:
+    """``report.html`` of a calibration: what n is, how sure, and how every board fits."""
+    motion = calibration.motion
+    sigma = motion.sigma.tolist()
+    rows = [
+        (Path(fit.scan).name, str(fit.corners), f"{fit.rmse_before_mm:.4f}", f"{fit.rmse_after_mm:.4f}")
+        for fit in calibration.boards
+    ]
+    curves = {str(calibration.method): calibration}
+    write_report(
+        folder,
+        title=f"Calibration from {len(boards)} board scan(s)",
+        lead=calibration_summary(calibration).splitlines()[0] + ". " + calibration.observability.advice,
+        headlines=[
+            Comparison("RMSE after", f"{calibration.rmse_after_mm:.4f} mm", f"before: {calibration.rmse_before_mm:.4f} mm"),
+            Comparison("Stretch", f"{motion.stretch:.6f}", "true over nominal travel"),
+            *(
+                Comparison(f"n{i + 1}", f"{value:+.6f}", f"± {sigma[i]:.1e} mm per mm")
+                for i, value in enumerate(motion.n.tolist())
+            ),
+        ],
+        tables=[Table("Boards", ("scan", "corners", "RMSE before [mm]", "RMSE after [mm]"), rows)],
+        figures=[
+            rmse_by_iteration(curves),
+            components_by_iteration(curves),
+            stretch_by_iteration(curves),
+            observability_bars(calibration),
+            *(
+                corner_positions(board, calibration, name=f"corner_positions_{index}", label=Path(board.scan).name)
+                for index, board in enumerate(boards, start=1)
+            ),
+        ],
+        settings=settings,
+    )  # fmt: skip
+
+
+def product_report(product: Product, valid_share: float, settings: dict, folder: Path) -> None:
+    """``report.html`` of a product: its size, how much was measured, colour and height of its beginning."""
+    rows = min(product.shape[0], _SHOWN_ROWS)
+    height = product.height(0, rows)
+    measured = height[torch.isfinite(height)]
+    span = f"{float(measured.min()):.2f} .. {float(measured.max()):.2f} mm" if measured.numel() else "nothing measured"
+    figures: list[ReportFigure] = [
+        product_images(
+            "product", "Colour and height", product.color(0, rows), height, product.pitch_mm, product.origin_mm
+        )
+    ]
+    write_report(
+        folder,
+        title=f"Corrected scan {product.path.stem}",
+        lead=f"Orthographic product of {product.metadata.get('scan', '')} in the frame of its motion.",
+        headlines=[
+            Comparison("Size", f"{product.shape[0]} x {product.shape[1]} cells", f"of {product.pitch_mm:.4f} mm"),
+            Comparison("Measured", f"{100 * valid_share:.1f} %", "of all cells"),
+            Comparison("Heights", span, f"first {rows} rows"),
+        ],
+        tables=[],
+        figures=figures,
+        settings=settings,
+    )

@@ -1,0 +1,34 @@
+"""A calibration in plain words, for the terminal."""
+
+import math
+
+from lsvision.types import Calibration
+
+
+def calibration_summary(calibration: Calibration) -> str:
+    """What the motion is, how sure that is, what is not known and what to do next."""
+    motion, observability = calibration.motion, calibration.observability
+    n, sigma = motion.n.tolist(), motion.sigma.tolist()
+    angle_x, angle_z = (math.degrees(math.atan2(n[i], n[1])) for i in (0, 2))
+    corners = sum(board.corners for board in calibration.boards)
+    lines = [
+        f"{calibration.method.replace('_', '-')} calibration of {len(calibration.boards)} board scan(s), "
+        f"{corners} corners: {observability.verdict}" + ("" if calibration.converged else ", NOT CONVERGED"),
+        f"  motion n     {_vector(n)}  ± {_vector(sigma, '.1e')}",
+        f"  stretch      {motion.stretch:.6f}, turned {angle_x:+.4f}° sideways and {angle_z:+.4f}° in depth",
+        f"  RMSE         {calibration.rmse_before_mm:.4f} -> {calibration.rmse_after_mm:.4f} mm "
+        f"({100 * calibration.improvement:.1f} % better)",
+    ]
+    unknown = [direction for direction in observability.directions if not direction.observed]
+    lines += [
+        f"  not measured {_vector(direction.vector, '+.2f')}: σ stays at {direction.posterior_sigma:.1e} "
+        f"of the prior's {direction.prior_sigma:.1e}"
+        for direction in unknown
+    ]
+    if observability.advice:
+        lines.append(f"  next         {observability.advice}")
+    return "\n".join(lines)
+
+
+def _vector(values: list[float] | tuple[float, float, float], spec: str = "+.6f") -> str:
+    return "(" + ", ".join(format(value, spec) for value in values) + ")"

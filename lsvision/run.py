@@ -1,0 +1,65 @@
+"""The command line: compose the configuration, turn it into dataclasses once, run one experiment.
+
+``python -m lsvision.run +experiment=paper``
+"""
+
+import logging
+import sys
+from pathlib import Path
+from typing import Any, cast
+
+import hydra
+import torch
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from lsvision.errors import ConfigError, LsvisionError
+from lsvision.experiments import EXPERIMENTS
+from lsvision.experiments.settings import build_settings
+
+log = logging.getLogger("lsvision")
+
+
+def config_folder() -> Path:
+    """The configs shipped with the package, or those of the checkout it runs from."""
+    package = Path(__file__).parent
+    shipped = package / "_configs"
+    return shipped if shipped.is_dir() else package.parent / "configs"
+
+
+def _run(config: DictConfig) -> None:
+    if config.name not in EXPERIMENTS:
+        raise ConfigError(f"no experiment chosen: add +experiment=NAME with NAME one of {', '.join(EXPERIMENTS)}")
+    experiment, schema = EXPERIMENTS[config.name]
+    try:
+        values = cast(dict[str, Any], OmegaConf.to_container(config, resolve=True, throw_on_missing=True))
+    except OmegaConfBaseException as error:
+        raise ConfigError(str(error).splitlines()[0]) from error
+    settings = build_settings(schema, values)
+    torch.manual_seed(settings.seed)
+    torch.set_num_threads(settings.threads)
+    experiment(settings, Path(HydraConfig.get().runtime.output_dir))
+
+
+@hydra.main(version_base="1.3", config_path=str(config_folder()), config_name="config")
+def main(config: DictConfig) -> None:
+    """Run the experiment that the configuration names; an expected failure is one line and exit code 1."""
+    try:
+        _run(config)
+    except LsvisionError as error:
+        _log_trace_to_file()
+        print(f"error: {error}", file=sys.stderr)
+        raise SystemExit(1) from None
+
+
+def _log_trace_to_file() -> None:
+    """Write the current exception's trace to the run's log file, past the console."""
+    record = logging.LogRecord("lsvision", logging.ERROR, __file__, 0, "failed", None, sys.exc_info())
+    for handler in logging.getLogger().handlers:
+        if isinstance(handler, logging.FileHandler):
+            handler.handle(record)
+
+
+if __name__ == "__main__":
+    main()
