@@ -1,0 +1,242 @@
+"""Simulated line-scan stereo scans, rendered strip by strip."""
+
+import dataclasses
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Literal
+
+import torch
+from torch import Tensor
+
+from lsvision.errors import ConfigError
+from lsvision.geometry import project
+from lsvision.simulation.config import EncoderConfig, MotionConfig, SceneConfig, SensorConfig
+from lsvision.simulation.noise import lattice_hash
+from lsvision.simulation.plane import Pose
+from lsvision.simulation.scene import build_scene, place, scene_lines
+from lsvision.simulation.sensor import expose, halo_px, integrate, sample_offsets
+from lsvision.simulation.surfaces import Look, Scene
+from lsvision.simulation.trajectory import Trajectory, cast_rays
+from lsvision.types import Board, Rig, Transport, Travel
+
+Camera = Literal["left", "right"]
+
+# Lines rendered at once. Blocks lie at multiples of it whatever strips are asked for, so every strip height gives the
+# same bits; 32 lines of samples stay near the processor's cache.
+_BLOCK = 32
+_LOG_STREAM = 7
+
+
+@dataclass(frozen=True)
+class Simulation:
+    """One simulated pass of an object under the rig; nothing is rendered before it is asked for.
+
+    Attributes:
+        lines: number of lines.
+        travel: what the scan's file would say about the travel: the constant pitch, or the encoder's log.
+        pose: where the target stands, ``p = R p_target + T`` in the scan frame.
+        trajectory: the true motion, vibration and uneven travel included.
+    """
+
+    rig: Rig
+    board: Board
+    scene: SceneConfig
+    sensor: SensorConfig
+    trajectory: Trajectory
+    travel: Travel
+    lines: int
+    pose: Pose
+
+    @property
+    def channels(self) -> int:
+        """1 for a mono sensor, otherwise 3."""
+        return 1 if self.sensor.mono else 3
+
+    def strips(self, camera: Camera, strip_lines: int = 256) -> Iterator[Tensor]:
+        """Consecutive strips ``(h, width, channels)`` of one camera's image, uint8 or uint16.
+
+        The pixels do not depend on ``strip_lines``; the memory does not depend on the number of lines.
+        """
+        blocks = (self._expose_block(camera, first) for first in range(0, self.lines, _BLOCK))
+        return _regroup(blocks, strip_lines, self.lines)
+
+    def depth_strips(self, strip_lines: int = 256) -> Iterator[Tensor]:
+        """Strips ``(h, width)`` of the true depth z, mm, float32, at the centre of every pixel of the left image."""
+        columns = torch.arange(self.rig.width_px, dtype=torch.float64)
+        blocks = (
+            self._look("left", columns, torch.arange(first, first + _BLOCK, dtype=torch.float64)).z
+            for first in range(0, self.lines, _BLOCK)
+        )
+        return _regroup(blocks, strip_lines, self.lines)
+
+    def corners(self) -> tuple[Tensor, Tensor]:
+        """True pixel positions (column, line) of the board's corners in the left and right image, float64."""
+        points = self.board.corner_points() @ self.pose.rotation.mT + self.pose.translation
+        x, line, z = self.trajectory.project(points)
+        left, right = project(self.rig, x, z)
+        return torch.stack([left, line], dim=-1), torch.stack([right, line], dim=-1)
+
+    def truth(self) -> dict[str, Any]:
+        """What was simulated, as plain values for a JSON file.
+
+        ``n``, ``stretch``, ``R``, ``T``, ``lines``, the settings under ``args``, and for a board its corners as
+        (column, line) in the order of ``Board.corner_points``.
+        """
+        trajectory = self.trajectory
+        args = {
+            "scene": dataclasses.asdict(self.scene),
+            "motion": dataclasses.asdict(trajectory.motion),
+            "encoder": dataclasses.asdict(trajectory.encoder),
+            "sensor": dataclasses.asdict(self.sensor),
+            "line_pitch_mm": trajectory.line_pitch_mm,
+            "transport": trajectory.transport,
+        }
+        truth: dict[str, Any] = {
+            "n": trajectory.n.tolist(),
+            "stretch": trajectory.motion.stretch,
+            "R": self.pose.rotation.tolist(),
+            "T": self.pose.translation.tolist(),
+            "lines": self.lines,
+            "args": args,
+        }
+        if self.scene.kind == "board":
+            left, right = self.corners()
+            truth |= {"corners_left_px": left.tolist(), "corners_right_px": right.tolist()}
+        return truth
+
+    @cached_property
+    def _scene(self) -> Scene:
+        return build_scene(self.rig, self.board, self.scene, self.pose, self.trajectory.n)
+
+    def _expose_block(self, camera: Camera, first: int) -> Tensor:
+        reach = halo_px(self.sensor)
+        columns = sample_offsets(-reach, self.rig.width_px + 2 * reach, self.sensor)
+        lines = sample_offsets(first - reach, _BLOCK + 2 * reach, self.sensor)
+        light = integrate(self._look(camera, columns, lines).color, self.sensor)
+        seed = lattice_hash(torch.tensor(first), int(camera == "right"), self.sensor.seed)
+        return expose(light, self.sensor, int((float(seed) + 1.0) * 2**30))
+
+    def _look(self, camera: Camera, columns: Tensor, lines: Tensor) -> Look:
+        """What samples see; the colours of a trilinear sensor look at planes of their own."""
+        spacing = self.rig.color_spacing_lines
+        if not any(spacing):
+            return self._scene.look(cast_rays(self.trajectory, camera, columns, lines))
+        looks = [self._look_channel(camera, columns, lines, shift) for shift in spacing]
+        return Look(torch.stack([look.color[c] for c, look in enumerate(looks)]), looks[1].z)
+
+    def _look_channel(self, camera: Camera, columns: Tensor, lines: Tensor, spacing: float) -> Look:
+        """One colour, seen ``spacing`` lines further along Y; a registering camera takes it that much sooner."""
+        if self.sensor.color_registered:
+            lines = lines - self.trajectory.sign * spacing
+        plane_y = spacing * self.trajectory.line_pitch_mm
+        return self._scene.look(cast_rays(self.trajectory, camera, columns, lines, plane_y))
+
+
+def simulate(
+    rig: Rig,
+    board: Board,
+    scene: SceneConfig,
+    motion: MotionConfig,
+    sensor: SensorConfig,
+    line_pitch_mm: float,
+    *,
+    lines: int | None = None,
+    transport: Transport = "forward",
+    encoder: EncoderConfig | None = None,
+) -> Simulation:
+    """Set up a scan of a board, sheet or rail.
+
+    Args:
+        rig: the cameras. board: drawn where ``scene.kind`` is "board".
+        line_pitch_mm: nominal travel per line.
+        lines: length of the scan; chosen so that the target fits with its margin where it is None.
+        transport: "reverse" turns the image upside down.
+        encoder: uneven line trigger with a log; None for a constant pitch.
+
+    Raises:
+        ConfigError: an option that no scan can be made with; the message names it.
+    """
+    _check(scene, sensor, motion, line_pitch_mm, lines)
+    trajectory = Trajectory(rig, motion, encoder or EncoderConfig(), line_pitch_mm, transport)
+    if lines is None:
+        lines = scene_lines(board, scene, trajectory.n, line_pitch_mm)
+    middle_mm = trajectory.sign * line_pitch_mm * (lines - 1) / 2
+    pose = place(rig, board, scene, trajectory.n, middle_mm)
+    return Simulation(rig, board, scene, sensor, trajectory, _logged_travel(trajectory, lines), lines, pose)
+
+
+def scaled_rig(rig: Rig, scale: float) -> Rig:
+    """The same cameras with ``scale`` times larger pixels, over the same field; the line pitch should grow as much.
+
+    Source: the edge of the first pixel stays where it is, so a column c becomes (c + 0.5) / scale - 0.5.
+    """
+    if scale < 1:
+        raise ValueError(f"scale must be at least 1, got {scale}")
+    red, green, blue = rig.color_spacing_lines
+    return dataclasses.replace(
+        rig,
+        width_px=math.ceil(rig.width_px / scale),
+        pixel_pitch_um=rig.pixel_pitch_um * scale,
+        principal_left_px=(rig.principal_left_px + 0.5) / scale - 0.5,
+        principal_right_px=(rig.principal_right_px + 0.5) / scale - 0.5,
+        color_spacing_lines=(red / scale, green / scale, blue / scale),
+    )
+
+
+def _logged_travel(trajectory: Trajectory, lines: int) -> Travel:
+    """The travel as an encoder recorded it, counted positive along the transport."""
+    encoder, pitch = trajectory.encoder, trajectory.line_pitch_mm
+    if not encoder.enabled:
+        return Travel(pitch, None, trajectory.transport)
+    position = trajectory.sign * trajectory.position(torch.arange(lines, dtype=torch.float64))
+    generator = torch.Generator().manual_seed(encoder.seed * 8 + _LOG_STREAM)
+    log = position + encoder.noise_mm * torch.randn(lines, generator=generator, dtype=torch.float64)
+    if not bool((log.diff() > 0).all()):
+        raise ConfigError(
+            "encoder.wobble_mm, encoder.noise_mm: so uneven that the log runs backwards at this line pitch"
+        )
+    return Travel(pitch, log, trajectory.transport)
+
+
+def _check(
+    scene: SceneConfig, sensor: SensorConfig, motion: MotionConfig, line_pitch_mm: float, lines: int | None
+) -> None:
+    problems = {
+        "line_pitch_mm: must be positive": line_pitch_mm > 0,
+        "lines: must be at least 1": lines is None or lines >= 1,
+        "scene.kind: must be board, sheet or rail": scene.kind in ("board", "sheet", "rail"),
+        "scene.texture_mm: must be positive": scene.texture_mm > 0,
+        "scene: a rail runs along the motion; pitch_deg and yaw_deg must be 0": scene.kind != "rail"
+        or (scene.pitch_deg == 0 and scene.yaw_deg == 0),
+        "sensor.bits: must be 8 or 16": sensor.bits in (8, 16),
+        "sensor.supersampling: must be at least 1": sensor.supersampling >= 1,
+        "sensor.blur_px: must not be negative": sensor.blur_px >= 0,
+        "motion.stretch: must be positive": motion.stretch > 0,
+        "motion.vibration_wavelengths_mm: must hold positive lengths": bool(motion.vibration_wavelengths_mm)
+        and min(motion.vibration_wavelengths_mm) > 0,
+    }
+    for problem, fine in problems.items():
+        if not fine:
+            raise ConfigError(problem)
+
+
+def _regroup(blocks: Iterator[Tensor], strip_lines: int, total: int) -> Iterator[Tensor]:
+    """Cut a stream of blocks into strips of another height."""
+    if strip_lines < 1:
+        raise ValueError(f"strip_lines must be at least 1, got {strip_lines}")
+    return _cut(blocks, strip_lines, total)
+
+
+def _cut(blocks: Iterator[Tensor], strip_lines: int, total: int) -> Iterator[Tensor]:
+    pending: list[Tensor] = []
+    held = 0
+    for start in range(0, total, strip_lines):
+        wanted = min(strip_lines, total - start)
+        while held < wanted:
+            pending.append(next(blocks))
+            held += len(pending[-1])
+        joined = torch.cat(pending)
+        yield joined[:wanted]
+        pending, held = [joined[wanted:]], held - wanted

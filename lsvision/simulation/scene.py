@@ -1,0 +1,69 @@
+"""Where a target stands and what lies around it."""
+
+import math
+
+import torch
+from torch import Tensor
+
+from lsvision.geometry import product_axes, rotation_from_vector
+from lsvision.simulation.config import SceneConfig
+from lsvision.simulation.lighting import line_lights
+from lsvision.simulation.plane import Pose
+from lsvision.simulation.rail import RailScene
+from lsvision.simulation.surfaces import BoardScene, Conveyor, Scene, SheetScene, board_extent
+from lsvision.types import Board, Rig
+
+
+def place(rig: Rig, board: Board, scene: SceneConfig, n: Tensor, middle_mm: float) -> Pose:
+    """Pose of a target whose centre crosses the scan plane midway between the cameras after a travel of ``middle_mm``.
+
+    A rail's frame has its Y along the motion n; roll turns it about that axis.
+    """
+    depth = rig.zero_disparity_mm + scene.depth_offset_mm
+    middle = n.new_tensor([rig.baseline_mm / 2, 0.0, depth]) + middle_mm * n
+    if scene.kind == "rail":
+        rotation = product_axes(n).mT @ _turn(0.0, scene.roll_deg, 0.0)
+        return Pose(rotation, middle - n.new_tensor([0.0, 0.0, scene.rail_rise_mm]))
+    rotation = _turn(scene.pitch_deg, scene.roll_deg, scene.yaw_deg)
+    outline = _outline(board, scene)
+    center = torch.cat([outline.mean(0), outline.new_zeros(1)])
+    return Pose(rotation, middle - rotation @ center)
+
+
+def scene_lines(board: Board, scene: SceneConfig, n: Tensor, line_pitch_mm: float) -> int:
+    """Lines of a scan that shows the whole target and its margin, or the length of rail asked for."""
+    if scene.kind == "rail":
+        return math.ceil(scene.rail_length_mm / line_pitch_mm)
+    rotation = _turn(scene.pitch_deg, scene.roll_deg, scene.yaw_deg)
+    travel = _outline(board, scene) @ rotation[1, :2] / n[1]
+    return math.ceil((float(travel.max() - travel.min()) + 2 * scene.margin_mm) / line_pitch_mm)
+
+
+def build_scene(rig: Rig, board: Board, scene: SceneConfig, pose: Pose, n: Tensor) -> Scene:
+    """Target, conveyor and lights; n is the motion along which conveyor and rail run."""
+    lighting = line_lights(rig)
+    ground = n.new_tensor([rig.baseline_mm / 2, 0.0, rig.zero_disparity_mm + scene.conveyor_drop_mm])
+    conveyor = Conveyor(Pose(product_axes(n).mT, ground), lighting, scene.texture_mm, scene.seed)
+    if scene.kind == "board":
+        return BoardScene(board, scene, pose, lighting, conveyor)
+    if scene.kind == "sheet":
+        return SheetScene(scene, pose, lighting, conveyor)
+    return RailScene(scene, pose, lighting, conveyor)
+
+
+def _outline(board: Board, scene: SceneConfig) -> Tensor:
+    """Corners (4, 2) of a board or sheet in its own frame, mm."""
+    if scene.kind == "board":
+        side, right, bottom = board_extent(board)
+        border = torch.tensor([scene.board_border_x_mm, scene.board_border_y_mm], dtype=torch.float64)
+        low, high = -side - border, torch.tensor([right, bottom], dtype=torch.float64) + border
+    else:
+        high = torch.tensor([scene.sheet_width_mm, scene.sheet_height_mm], dtype=torch.float64)
+        low = torch.zeros_like(high)
+    return torch.cartesian_prod(*torch.stack([low, high], dim=-1))
+
+
+def _turn(pitch_deg: float, roll_deg: float, yaw_deg: float) -> Tensor:
+    """Rotation Rz(yaw) Ry(roll) Rx(pitch), float64."""
+    pitch, roll, yaw = rotation_from_vector(torch.tensor([pitch_deg, roll_deg, yaw_deg]).double().deg2rad().diag())
+    return yaw @ roll @ pitch
