@@ -37,6 +37,7 @@ def _run(config: DictConfig) -> None:
     except OmegaConfBaseException as error:
         raise ConfigError(str(error).splitlines()[0]) from error
     settings = build_settings(schema, values)
+    logging.getLogger("tifffile").setLevel(logging.CRITICAL)  # damaged files are reported once, by our own error
     torch.manual_seed(settings.seed)
     torch.set_num_threads(settings.threads)
     experiment(settings, Path(HydraConfig.get().runtime.output_dir))

@@ -34,6 +34,10 @@ def build_settings(schema: type[Settings], config: Mapping) -> Settings:
     except dacite.WrongTypeError as error:
         expected = getattr(error.field_type, "__args__", None) or getattr(error.field_type, "__name__", "")
         raise ConfigError(f"{error.field_path}: expected {_in_words(expected)}, got {error.value!r}") from error
+    except dacite.UnexpectedDataError as error:
+        raise ConfigError(f"{', '.join(sorted(error.keys))}: unknown option of {schema.__name__}") from error
+    except dacite.MissingValueError as error:
+        raise ConfigError(f"{error.field_path}: missing") from error
     except dacite.DaciteError as error:
         raise ConfigError(str(error)) from error
 

@@ -35,7 +35,7 @@ def calibration_report(calibration: Calibration, boards: Sequence[BoardCorners],
         title=f"Calibration from {len(boards)} board scan(s)",
         lead=calibration_summary(calibration).splitlines()[0] + ". " + calibration.observability.advice,
         headlines=[
-            Comparison("RMSE after", f"{calibration.rmse_after_mm:.4f} mm", f"before: {calibration.rmse_before_mm:.4f} mm"),
+            Comparison("RMSE", f"{calibration.rmse_after_mm:.4f} mm", f"before: {calibration.rmse_before_mm:.4f} mm"),
             Comparison("Stretch", f"{motion.stretch:.6f}", "true over nominal travel"),
             *(
                 Comparison(f"n{i + 1}", f"{value:+.6f}", f"± {sigma[i]:.1e} mm per mm")
