@@ -39,7 +39,7 @@ def fit_saddles(
     parameters per window; the covariance is the residual variance times the inverse normal matrix.
 
     Args:
-        windows: grey values, odd size; the corner within about two pixels of the centre.
+        windows: grey values, odd size; the corner within about two pixels of the centre. One with a NaN is not valid.
         angles: direction of the normal of each edge, rad from u towards v; good to about 0.3 rad.
         iterations: number of steps, the same for all windows.
         max_shift_px: a corner further than this from the centre is not valid.
@@ -50,6 +50,8 @@ def fit_saddles(
     axis = torch.arange(size, dtype=windows.dtype, device=windows.device) - half
     grid = torch.stack(torch.meshgrid(axis, axis, indexing="xy"), dim=-1).reshape(1, -1, 2)
     values = windows.reshape(count, -1)
+    complete = torch.isfinite(values).all(-1)
+    values = torch.where(complete[:, None], values, 0.0)
     parameters = _initial_parameters(values, grid, angles)
     damping = torch.full((count,), 1e-2, dtype=values.dtype, device=values.device)
     model, jacobian = _saddle(parameters, grid)
@@ -70,11 +72,11 @@ def fit_saddles(
     position, contrast, residual = parameters[:, _POSITION], parameters[:, _CONTRAST].abs(), variance.sqrt()
     crossing = torch.sin(parameters[:, _ANGLE_1] - parameters[:, _ANGLE_2]).abs()
     valid = (
-        (torch.linalg.vector_norm(position, dim=-1) < max_shift_px)
+        complete
+        & (torch.linalg.vector_norm(position, dim=-1) < max_shift_px)
         & (residual < max_residual * contrast)
         & (crossing > 0.2)  # edges nearly parallel: not a corner
         & (parameters[:, _BLUR] < half / 2)
-        & torch.isfinite(cost)
     )
     covariance = inverse[:, _POSITION, _POSITION] * variance[:, None, None]
     return SaddleFit(position, covariance, parameters[:, _BLUR], contrast, residual, valid)
@@ -129,12 +131,12 @@ def _initial_parameters(values: Tensor, grid: Tensor, angles: Tensor) -> Tensor:
 
 
 def _damped_step(jacobian: Tensor, residual: Tensor, damping: Tensor) -> Tensor:
-    normal = jacobian.mT @ jacobian
-    gradient = (jacobian.mT @ residual[..., None])[..., 0]
-    diagonal = normal.diagonal(dim1=-2, dim2=-1)
-    # The floor keeps a window without contrast solvable; it is rejected afterwards by its residual.
-    damped = normal + torch.diag_embed(damping[:, None] * diagonal + 1e-9 * (1.0 + diagonal.amax(-1, keepdim=True)))
-    return torch.linalg.solve(damped, gradient)
+    """Levenberg-Marquardt step, in parameters scaled so that the unit of the grey values does not matter."""
+    length = torch.linalg.vector_norm(jacobian, dim=-2)
+    length = torch.where(length > 0, length, 1.0)  # without contrast nothing moves the corner
+    scaled = jacobian / length[:, None]
+    normal = scaled.mT @ scaled + torch.diag_embed(damping[:, None].expand_as(length))
+    return torch.linalg.solve(normal, scaled.mT @ residual[..., None])[..., 0] / length
 
 
 def _bounded(parameters: Tensor) -> Tensor:
