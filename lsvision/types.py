@@ -8,7 +8,7 @@ frame C, product frame M.
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal, Protocol
+from typing import Literal, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Float
@@ -85,6 +85,7 @@ class Travel:
     transport: Transport = "forward"
 
 
+@runtime_checkable
 class LineImage(Protocol):
     """A tall image read by line ranges; nothing ever loads the whole of it."""
 
