@@ -1,6 +1,8 @@
 """Estimation of Gaussian states: cubature regression, square-root filters, joint update, least squares, information."""
 
-from lsvision.estimation.cubature import cubature_points, sigma_moments, slr
+from lsvision.estimation.consistency import mean_chi_square_band, nees, nis
+from lsvision.estimation.cubature import slr
+from lsvision.estimation.filtering import Track, Update, filter_sequence, predict, update
 from lsvision.estimation.information import (
     cramer_rao_bound,
     fisher_information,
@@ -8,20 +10,31 @@ from lsvision.estimation.information import (
     weighed_directions,
 )
 from lsvision.estimation.joint import Info, Posterior, Rows, iterated_update, lower_factor, measurement, whitened_rows
+from lsvision.estimation.least_squares import LeastSquares, levenberg_marquardt
+from lsvision.estimation.smoothing import smooth
 
 __all__ = [
     "Info",
+    "LeastSquares",
     "Posterior",
     "Rows",
+    "Track",
+    "Update",
     "cramer_rao_bound",
-    "cubature_points",
+    "filter_sequence",
     "fisher_information",
     "iterated_update",
+    "levenberg_marquardt",
     "lower_factor",
     "marginal_information",
+    "mean_chi_square_band",
     "measurement",
-    "sigma_moments",
+    "nees",
+    "nis",
+    "predict",
     "slr",
+    "smooth",
+    "update",
     "weighed_directions",
     "whitened_rows",
 ]

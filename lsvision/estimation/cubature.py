@@ -14,16 +14,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from lsvision.estimation.square_root import ordered_sum
+
 Function = Callable[[Tensor], Tensor]
-"""Takes points ``(points, *batch, state)`` to values ``(points, *batch, measurement)``; parameters lead by ``*batch``."""
-
-
-def cubature_points(
-    mean: Float[Tensor, "*batch state"], chol: Float[Tensor, "*batch state state"]
-) -> Float[Tensor, "points *batch state"]:
-    """The 2n equally weighted points of N(mean, chol cholᵀ): first all m + √n L e_i, then all m - √n L e_i."""
-    offsets = math.sqrt(mean.shape[-1]) * chol.movedim(-1, 0)
-    return torch.cat([mean + offsets, mean - offsets])
+"""Takes points ``(points, *batch, state)`` to values ``(points, *batch, measurement)``; parameters ``(*batch, ..)``."""
 
 
 def slr(
@@ -42,25 +36,30 @@ def slr(
     Returns:
         A, b and a factor of Ω, ``factor @ factor.mT``; it is not triangular, and its rank is below ``state``.
     """
-    center, odd, even = sigma_moments(h, mean, chol)
+    center, odd, even = sigma_moments(h, mean.movedim(-1, 0), chol.movedim((-2, -1), (0, 1)))
+    odd, even = (part.movedim((0, 1), (-2, -1)) for part in (odd, even))
     A = torch.linalg.solve_triangular(chol, odd, upper=False, left=False)
-    return A, center - (A @ mean[..., None])[..., 0], even
+    return A, center.movedim(0, -1) - (A @ mean[..., None])[..., 0], even
 
 
 def sigma_moments(
-    h: Function, mean: Float[Tensor, "*batch state"], chol: Float[Tensor, "*batch state columns"]
+    h: Function, mean: Float[Tensor, "state *batch"], factor: Float[Tensor, "state columns *batch"]
 ) -> tuple[
-    Float[Tensor, "*batch measurement"],
-    Float[Tensor, "*batch measurement columns"],
-    Float[Tensor, "*batch measurement columns"],
+    Float[Tensor, "measurement *batch"],
+    Float[Tensor, "measurement columns *batch"],
+    Float[Tensor, "measurement columns *batch"],
 ]:
-    """Mean of h, and its deviations split into what a line explains, A L, and the rest, a factor of Ω.
+    """Mean of h, and its deviations split into what a line explains, A L, and the rest, a factor of Ω; batch last.
 
-    Cov h = odd oddᵀ + even evenᵀ and Cov(x, h) = L oddᵀ.
+    Cov h = odd oddᵀ + even evenᵀ and Cov(x, h) = L oddᵀ. The factor may be any with L Lᵀ = P, of ``state`` columns.
     """
-    plus, minus = h(cubature_points(mean, chol)).chunk(2)
-    middle = (plus + minus) / 2
-    center = middle.mean(0)
-    scale = math.sqrt(chol.shape[-1])
-    odd, even = (plus - minus) / (2 * scale), (middle - center) / scale
-    return center, odd.movedim(0, -1), even.movedim(0, -1)
+    columns = factor.shape[1]
+    scale, pivot = math.sqrt(columns), mean[:, None]
+    points = factor.new_empty(len(factor), 2 * columns, *factor.shape[2:])
+    torch.add(pivot, factor, alpha=scale, out=points[:, :columns])
+    torch.sub(pivot, factor, alpha=scale, out=points[:, columns:])
+    values = h(points.movedim(0, -1)).movedim(-1, 0)
+    plus, minus = values[:, :columns], values[:, columns:]
+    middle = (plus + minus).div_(2)
+    center = ordered_sum(middle) / columns
+    return center[:, 0], (plus - minus).div_(2 * scale), (middle - center).div_(scale)

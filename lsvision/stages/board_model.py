@@ -6,9 +6,9 @@ the centroid) has the residual
 
     e = (x, 0, z) + y n - (exp(θ) R0 p + t),      Cov e = M Σ Mᵀ,   M = [e_x | n | e_z].
 
-It is linear in t and n, and only θ needs cubature points. M⁻¹ is ``scan_position``: it turns a displacement of the object
-into one of the measurement. The derivative by n is the predicted travel, not the measured: the noise of y, multiplied by
-an n that the board cannot show, would pass for knowledge of it.
+It is linear in t and n, and only θ needs cubature points. M⁻¹ is ``scan_position``: it turns a displacement of the
+object into one of the measurement. The derivative by n is the predicted travel, not the measured: the noise of y,
+multiplied by an n that the board cannot show, would pass for knowledge of it.
 
 Source: Wang et al. 2024, Eq. 10-18; M generalises its R + σ_y² n nᵀ to noise that is correlated.
 """
@@ -97,15 +97,16 @@ def residuals(problem: BoardProblem, state: Float[Tensor, "*#batch state"]) -> F
     return torch.where(problem.valid[..., None], error, 0.0)
 
 
-def whitened_residuals(
-    problem: BoardProblem, state: Float[Tensor, "*#batch state"]
-) -> Float[Tensor, "*batch boards corners 3"]:
-    """Measured less predicted (x, y, z) of all corners in standard deviations, exactly: the likelihood's residuals."""
+def whitened_residuals(problem: BoardProblem, state: Float[Tensor, "*#batch state"]) -> Float[Tensor, "*batch rows"]:
+    """Measured less predicted values in standard deviations, exactly: three a corner, and one of a mounting pitch."""
     theta, position, n = split_state(state)
     rotation = rotation_from_vector(theta) @ problem.rotation
     predicted = scan_position(transform(rotation, position, problem.body_points), n[..., None, None, :])
     error = torch.linalg.solve_triangular(problem.noise_chol, (problem.points - predicted)[..., None], upper=False)
-    return torch.where(problem.valid[..., None], error[..., 0], 0.0)
+    rows = torch.where(problem.valid[..., None], error[..., 0], 0.0).flatten(-3)
+    if problem.pitch is None:
+        return rows
+    return torch.cat([rows, (problem.pitch.angle - _pitch_angle(problem, theta)) / problem.pitch.sigma], dim=-1)
 
 
 def linearise(
@@ -115,22 +116,28 @@ def linearise(
 
     The linearisation's errors of different boards are taken as independent.
     """
-    theta, position, n = split_state(mean)
-    theta_chol = lower_factor(factor[..., :-3, :].unflatten(-2, (problem.boards, 6))[..., :3, :])
-    A, b, error = slr(lambda vector: _turned(problem, vector), theta, theta_chol)
-    turned = ((A @ theta[..., None])[..., 0] + b).unflatten(-1, (-1, 3))
-    predicted = scan_position(turned + position[..., None, :], n[..., None, None, :])
-    residual = displace(problem.points - predicted, n[..., None, None, :])
-    eye = torch.eye(3, dtype=mean.dtype, device=mean.device).expand(*residual.shape, 3)
-    by_n = predicted[..., 1, None, None] * eye
-    columns = torch.cat([-A.unflatten(-2, (-1, 3)), -eye, by_n, error.unflatten(-2, (-1, 3)), -residual[..., None]], -1)
-    columns = scan_position(columns.mT, n[..., None, None, None, :]).mT
-    rows = whitened_rows(columns[..., :9], columns[..., 12], columns[..., 9:12], problem.noise_chol, problem.valid)
+    A, error, residual = _measured_model(problem, mean, factor)
+    rows = whitened_rows(A, residual, error, problem.noise_chol, problem.valid)
+    n = mean[..., -3:]
     by_motion = 2 * problem.valid.sum((-2, -1)) * n[..., 1].abs().log()
     joined = _scatter(rows.matrix)
     if problem.pitch is not None:
-        joined = torch.cat([joined, _pitch_row(problem, problem.pitch, theta, theta_chol)], dim=-2)
+        joined = torch.cat([joined, _pitch_row(problem, problem.pitch, mean, factor)], dim=-2)
     return Rows(joined, rows.log_det.sum(-1) + by_motion)
+
+
+def corner_rows(
+    problem: BoardProblem, mean: Float[Tensor, "*batch state"], factor: Float[Tensor, "*batch state columns"]
+) -> Float[Tensor, "*batch boards corners 3 columns"]:
+    """Whitened rows ``[A | r]`` of each corner by itself about a Gaussian state, for a filter that takes them in turn."""
+    A, error, residual = _measured_model(problem, mean, factor)
+    columns = torch.cat([error, A, residual[..., None]], dim=-1)
+    columns = torch.linalg.solve_triangular(problem.noise_chol, columns, upper=False)
+    error, rows = columns[..., :3], columns[..., 3:]
+    eye = torch.eye(3, dtype=mean.dtype, device=mean.device).expand_as(error)
+    rows = torch.linalg.solve_triangular(lower_factor(torch.cat([eye, error], dim=-1)), rows, upper=False)
+    rows = torch.where(problem.valid[..., None, None], rows, 0.0)
+    return _scatter(rows.flatten(-3, -2)).unflatten(-2, (*problem.valid.shape[-2:], 3))
 
 
 def motion_information(problem: BoardProblem, state: Float[Tensor, "*batch state"]) -> Float[Tensor, "*batch 3 3"]:
@@ -166,14 +173,37 @@ def _scatter(matrix: Tensor) -> Tensor:
     return torch.cat([poses, matrix[..., 6:]], dim=-1).flatten(-3, -2)
 
 
-def _pitch_row(problem: BoardProblem, pitch: MountingPitch, theta: Tensor, theta_chol: Tensor) -> Tensor:
+def _measured_model(problem: BoardProblem, mean: Tensor, factor: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Each corner's affine model in measured coordinates: by its board's nine unknowns, its error's factor, residual.
+
+    Shapes ``(*batch, boards, corners, 3, 9)``, ``(.., 3, 3)`` and ``(.., 3)``.
+    """
+    theta, position, n = split_state(mean)
+    A, b, error = slr(lambda vector: _turned(problem, vector), theta, _theta_chol(problem, factor))
+    turned = ((A @ theta[..., None])[..., 0] + b).unflatten(-1, (-1, 3))
+    predicted = scan_position(turned + position[..., None, :], n[..., None, None, :])
+    eye = torch.eye(3, dtype=mean.dtype, device=mean.device).expand(*predicted.shape, 3)
+    moves = torch.cat(
+        [A.unflatten(-2, (-1, 3)), eye, -predicted[..., 1, None, None] * eye, error.unflatten(-2, (-1, 3))], dim=-1
+    )
+    columns = scan_position(moves.mT, n[..., None, None, None, :]).mT
+    return columns[..., :9], columns[..., 9:], problem.points - predicted
+
+
+def _theta_chol(problem: BoardProblem, factor: Tensor) -> Tensor:
+    return lower_factor(factor[..., :-3, :].unflatten(-2, (problem.boards, 6))[..., :3, :])
+
+
+def _pitch_angle(problem: BoardProblem, theta: Tensor) -> Tensor:
+    """Angle of the boards' normals about the sensor axis, rad, ``(.., boards)``."""
+    normal = (rotation_from_vector(theta) @ problem.rotation)[..., 2]
+    return torch.atan2(-normal[..., 1], normal[..., 2])
+
+
+def _pitch_row(problem: BoardProblem, pitch: MountingPitch, mean: Tensor, factor: Tensor) -> Tensor:
     """The one whitened row of a known mounting pitch of a single board, whose theta comes first in the state."""
-
-    def angle(vector: Tensor) -> Tensor:
-        normal = (rotation_from_vector(vector) @ problem.rotation)[..., 2]
-        return torch.atan2(-normal[..., 1], normal[..., 2])[..., None]
-
-    A, b, _ = slr(angle, theta, theta_chol)
+    theta = split_state(mean)[0]
+    A, b, _ = slr(lambda vector: _pitch_angle(problem, vector)[..., None], theta, _theta_chol(problem, factor))
     expected = (A @ theta[..., None])[..., 0] + b
     row = torch.cat([A[..., 0, :], A.new_zeros(*A.shape[:-2], 6), pitch.angle - expected], dim=-1)
     return row / pitch.sigma

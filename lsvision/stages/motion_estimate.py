@@ -4,6 +4,7 @@ All methods hold the prior on n (and on the poses, where one is wanted) fixed an
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 
@@ -11,10 +12,28 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from lsvision.estimation import Info, Posterior, Rows, iterated_update
+from lsvision.estimation import (
+    Info,
+    Posterior,
+    Rows,
+    filter_sequence,
+    iterated_update,
+    levenberg_marquardt,
+    nees,
+)
 from lsvision.estimation.joint import Linearise
-from lsvision.stages.board_model import POINT_SPREAD, BoardProblem, linearise, residuals
+from lsvision.stages.board_model import (
+    POINT_SPREAD,
+    BoardProblem,
+    corner_rows,
+    linearise,
+    residuals,
+    whitened_residuals,
+)
 from lsvision.types import CalibrationMethod
+
+# Standard deviation, rad or mm, of a flat prior where a filter needs a number.
+_FLAT = 1e5
 
 
 @dataclass(frozen=True)
@@ -32,7 +51,7 @@ class CalibrationConfig:
     rotation_sigma_rad: float = math.inf
     translation_sigma_mm: float = math.inf
     max_iterations: int = 20
-    tolerance: float = 1e-9  # Kullback-Leibler divergence between two iterates, nats
+    tolerance: float = 1e-6  # Kullback-Leibler divergence between two iterates, nats
     two_step_threshold_mm: float = 0.05  # RMSE below which Alg. 1 ends
     two_step_max_iterations: int = 20
     process_sigma: float = 0.0  # of the random walk of n per square root of a mm travelled; sequential only
@@ -42,7 +61,7 @@ class CalibrationConfig:
 
 def estimate(problem: BoardProblem, start: Float[Tensor, "*batch state"], config: CalibrationConfig) -> Posterior:
     """Posterior of the poses and n by the configured method."""
-    methods = {"joint": joint, "two_step": two_step}
+    methods = {"joint": joint, "two_step": two_step, "sequential": sequential, "least_squares": least_squares}
     return methods[config.method](problem, start, config)
 
 
@@ -86,6 +105,56 @@ def two_step(problem: BoardProblem, start: Float[Tensor, "*batch state"], config
     return Posterior(state, factor, torch.stack(path), iterations, info == int(Info.OK), info)
 
 
+def sequential(problem: BoardProblem, start: Float[Tensor, "*batch state"], config: CalibrationConfig) -> Posterior:
+    """Filter corner by corner, board after board in line order; n walks at random by the travel between corners.
+
+    The result is n at the end of the last scan. Each pass filters from the same prior with the corners linearised about
+    the pass before: the boards' poses do not move, so that their last state is their smoothed one.
+    """
+    rows_order, valid, process = _line_order(problem, config.process_sigma)
+    mean, factor, path = start, _point(start), [start]
+    running = torch.ones_like(start[..., 0], dtype=torch.bool)
+    iterations = torch.zeros_like(running, dtype=torch.long)
+    for _ in range(config.max_iterations):
+        rows = rows_order(corner_rows(problem, mean, factor))
+        track = filter_sequence(
+            lambda points, step, A=rows[..., :-1]: (A[step] @ points[..., None])[..., 0],
+            start - mean,
+            _wide_chol(start, config),
+            rows[..., -1],
+            torch.eye(3, dtype=start.dtype, device=start.device),
+            process,
+            valid=valid,
+            history=False,
+        )
+        new_mean, new_factor = mean + track.means[-1], track.factors[-1]
+        moved = nees(new_mean - mean, new_factor) / 2
+        mean = torch.where(running[..., None], new_mean, mean)
+        factor = torch.where(running[..., None, None], new_factor, factor)
+        path.append(mean)
+        iterations = iterations + running
+        running = running & ~(moved <= config.tolerance)
+        if not bool(running.any()):
+            break
+    info = torch.where(running, int(Info.NOT_CONVERGED), int(Info.OK))
+    info = torch.where(torch.isfinite(mean).all(-1), info, int(Info.SINGULAR))
+    return Posterior(mean, factor, torch.stack(path), iterations, info == int(Info.OK), info)
+
+
+def least_squares(problem: BoardProblem, start: Float[Tensor, "*batch state"], config: CalibrationConfig) -> Posterior:
+    """Maximum of the posterior by Levenberg-Marquardt on the exact residuals: the reference for the other methods."""
+    root = prior_root(start, config)
+
+    def residual(state: Tensor) -> Tensor:
+        from_prior = (root @ (state - start)[..., None])[..., 0]
+        return torch.cat([whitened_residuals(problem, state), from_prior], dim=-1)
+
+    solution = levenberg_marquardt(residual, start, max_iterations=config.max_iterations)
+    info = torch.where(solution.converged, int(Info.OK), int(Info.NOT_CONVERGED))
+    info = torch.where(torch.isfinite(solution.factor).all((-2, -1)), info, int(Info.SINGULAR))
+    return Posterior(solution.state, solution.factor, solution.path, solution.iterations, solution.converged, info)
+
+
 def prior_root(start: Float[Tensor, "*batch state"], config: CalibrationConfig) -> Float[Tensor, "*batch state state"]:
     """Information root of the prior: diagonal, zero for what is flat."""
     boards = (start.shape[-1] - 3) // 6
@@ -121,6 +190,32 @@ def _given_rest(problem: BoardProblem, state: Tensor, part: slice) -> Linearise:
         return Rows(torch.cat([whole.matrix[..., part], whole.matrix[..., -1:]], -1), whole.log_det)
 
     return rows
+
+
+def _line_order(problem: BoardProblem, sigma: float) -> tuple[Callable[[Tensor], Tensor], Tensor, Tensor]:
+    """How to put corners, ``(*batch, boards, corners, ..)``, in line order, steps first; which are valid; √Q of n.
+
+    Corners that were not seen come last on their board and take no travel.
+    """
+    travel = torch.where(problem.valid, problem.points[..., 1].abs(), torch.inf)
+    travel, order = travel.sort(dim=-1)
+    batch = problem.valid.ndim - 2
+
+    def reorder(values: Tensor) -> Tensor:
+        index = order.reshape(*order.shape, *(1,) * (values.ndim - order.ndim)).expand_as(values)
+        return values.gather(batch + 1, index).flatten(batch, batch + 1).movedim(batch, 0)
+
+    valid = reorder(problem.valid)
+    between = torch.nn.functional.pad(travel.diff(dim=-1), (1, 0)).flatten(-2).movedim(-1, 0)
+    spread = sigma * torch.where(valid, between, 0.0).sqrt()
+    moving = torch.cat([spread.new_zeros(6 * problem.boards), spread.new_ones(3)])
+    return reorder, valid, torch.diag_embed(spread[..., None] * moving)
+
+
+def _wide_chol(start: Tensor, config: CalibrationConfig) -> Tensor:
+    """Cholesky factor of the prior; what is flat becomes so wide that its weight is lost in rounding."""
+    spread = prior_root(start, config).diagonal(dim1=-2, dim2=-1).clamp(min=1 / _FLAT).reciprocal()
+    return torch.diag_embed(spread)
 
 
 def _joint_factor(problem: BoardProblem, state: Tensor, root: Tensor) -> Tensor:

@@ -1,0 +1,41 @@
+"""Whether an estimator's errors are as large as it says: normalised squares against chi-square bands.
+
+Source: Bar-Shalom, Li & Kirubarajan 2001, sec. 5.4.
+"""
+
+import math
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+
+def nees(
+    error: Float[Tensor, "*batch state"], factor: Float[Tensor, "*batch state columns"]
+) -> Float[Tensor, "*batch"]:
+    """Normalised estimation error squared, eᵀ P⁻¹ e with P = factor factorᵀ; on average the size of the state."""
+    lower = torch.linalg.qr(factor.mT, mode="r").R.mT
+    return torch.linalg.solve_triangular(lower, error[..., None], upper=False).square().sum((-2, -1))
+
+
+def nis(whitened_innovation: Float[Tensor, "*batch measurement"]) -> Float[Tensor, "*batch"]:
+    """Normalised innovation squared; on average the size of the measurement."""
+    return whitened_innovation.square().sum(-1)
+
+
+def mean_chi_square_band(freedom: int, runs: int, probability: float = 0.95) -> tuple[float, float]:
+    """Bounds that the mean of ``runs`` chi-square values of ``freedom`` degrees keeps with a probability."""
+    total = freedom * runs
+    tail = (1 - probability) / 2
+    return _chi_square_quantile(tail, total) / runs, _chi_square_quantile(1 - tail, total) / runs
+
+
+def _chi_square_quantile(probability: float, freedom: int) -> float:
+    """The value below which a chi-square variable lies with a probability, by bisection of its distribution."""
+    low, high = 0.0, freedom + 20 * math.sqrt(2 * freedom) + 50
+    half = torch.tensor(freedom / 2, dtype=torch.float64)
+    while high - low > 1e-10 * high:
+        middle = (low + high) / 2
+        below = torch.special.gammainc(half, half.new_tensor(middle / 2)) < probability
+        low, high = (middle, high) if bool(below) else (low, middle)
+    return (low + high) / 2

@@ -1,0 +1,85 @@
+"""Levenberg-Marquardt least squares with the Jacobian by forward differentiation: the reference for the filters.
+
+Source: Marquardt 1963; Madsen, Nielsen & Tingleff 2004, Methods for Non-Linear Least Squares Problems, sec. 3.2.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+from torch.func import jacfwd
+
+_FIRST_DAMPING = 1e-6  # of the Jacobian's columns, scaled to unit length
+_LARGEST_DAMPING = 1e8
+
+
+@dataclass(frozen=True)
+class LeastSquares:
+    """Minimum of ‖residual‖²; ``factor @ factor.mT`` is (Jᵀ J)⁻¹ there, ``path`` the state by iteration."""
+
+    state: Float[Tensor, "*batch state"]
+    factor: Float[Tensor, "*batch state state"]
+    path: Float[Tensor, "iterations *batch state"]
+    iterations: Int[Tensor, "*batch"]
+    converged: Bool[Tensor, "*batch"]
+
+
+def levenberg_marquardt(
+    residual: Callable[[Tensor], Tensor],
+    start: Float[Tensor, "*batch state"],
+    *,
+    max_iterations: int = 50,
+    tolerance: float = 1e-6,
+) -> LeastSquares:
+    """Minimise ‖residual(x)‖² for a batch of independent problems.
+
+    Args:
+        residual: takes ``(*batch, state)`` to whitened residuals ``(*batch, rows)``; at least as many rows as states.
+        tolerance: length of a step, in standard deviations of the state, at which a problem has converged.
+    """
+    state, values, path = start, residual(start), [start]
+    damping = torch.full_like(start[..., 0], _FIRST_DAMPING)
+    running = torch.isfinite(values).all(-1)
+    iterations = torch.zeros_like(running, dtype=torch.long)
+    for _ in range(max_iterations):
+        jacobian = _batch_jacobian(residual, state)
+        step = _damped_step(jacobian, values, damping)
+        trial = state + step
+        trial_values = residual(trial)
+        better = running & (trial_values.square().sum(-1) <= values.square().sum(-1))
+        state = torch.where(better[..., None], trial, state)
+        values = torch.where(better[..., None], trial_values, values)
+        iterations = iterations + running
+        path.append(state)
+        damping = torch.where(better, damping / 10, damping * 10)
+        length = (jacobian @ step[..., None]).square().sum((-2, -1)).sqrt()
+        settled = (length <= tolerance) & (damping <= 1)  # a step that damping made short says nothing
+        running = running & ~settled & (damping < _LARGEST_DAMPING)
+        if not bool(running.any()):
+            break
+    root = torch.linalg.qr(_batch_jacobian(residual, state), mode="r").R
+    eye = torch.eye(state.shape[-1], dtype=state.dtype, device=state.device).expand_as(root)
+    factor = torch.linalg.solve_triangular(root, eye, upper=True)
+    converged = ~running & (damping < _LARGEST_DAMPING) & torch.isfinite(values).all(-1)
+    return LeastSquares(state, factor, torch.stack(path), iterations, converged)
+
+
+def _damped_step(jacobian: Tensor, values: Tensor, damping: Tensor) -> Tensor:
+    """Solution of min ‖J dx + r‖² + damping ‖D dx‖², D the lengths of J's columns."""
+    lengths = torch.linalg.vector_norm(jacobian, dim=-2)
+    weight = torch.diag_embed(lengths * damping.sqrt()[..., None])
+    right = torch.cat([-values, torch.zeros_like(lengths)], dim=-1)
+    triangle = torch.linalg.qr(torch.cat([torch.cat([jacobian, weight], -2), right[..., None]], -1), mode="r").R
+    size = lengths.shape[-1]
+    return torch.linalg.solve_triangular(triangle[..., :size, :size], triangle[..., :size, size:], upper=True)[..., 0]
+
+
+def _batch_jacobian(residual: Callable[[Tensor], Tensor], state: Tensor) -> Tensor:
+    """Derivative ``(*batch, rows, state)`` of a function that works problem by problem.
+
+    One column a direction, the same for all problems: J e_i is the derivative along e_i.
+    """
+    offset = torch.zeros_like(state[(0,) * (state.ndim - 1)])
+    return jacfwd(lambda move: residual(state + move))(offset)
