@@ -9,9 +9,10 @@ from lsvision.estimation.information import (
     marginal_information,
     weighed_directions,
 )
-from lsvision.estimation.joint import Info, Posterior, Rows, iterated_update, lower_factor, measurement, whitened_rows
+from lsvision.estimation.joint import Info, Posterior, Rows, iterated_update, measurement, whitened_rows
 from lsvision.estimation.least_squares import LeastSquares, levenberg_marquardt
 from lsvision.estimation.smoothing import smooth
+from lsvision.estimation.triangular import apply, lower_factor, solve_upper, upper_root
 
 __all__ = [
     "Info",
@@ -20,6 +21,7 @@ __all__ = [
     "Rows",
     "Track",
     "Update",
+    "apply",
     "cramer_rao_bound",
     "filter_sequence",
     "fisher_information",
@@ -34,7 +36,9 @@ __all__ = [
     "predict",
     "slr",
     "smooth",
+    "solve_upper",
     "update",
+    "upper_root",
     "weighed_directions",
     "whitened_rows",
 ]

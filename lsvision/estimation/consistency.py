@@ -9,13 +9,16 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from lsvision.estimation.triangular import lower_factor, solve_upper
+
 
 def nees(
     error: Float[Tensor, "*batch state"], factor: Float[Tensor, "*batch state columns"]
 ) -> Float[Tensor, "*batch"]:
     """Normalised estimation error squared, eᵀ P⁻¹ e with P = factor factorᵀ; on average the size of the state."""
-    lower = torch.linalg.qr(factor.mT, mode="r").R.mT
-    return torch.linalg.solve_triangular(lower, error[..., None], upper=False).square().sum((-2, -1))
+    lower = lower_factor(factor)
+    whitened = solve_upper(lower.flip(-2, -1), error.flip(-1)[..., None])
+    return whitened.square().sum((-2, -1))
 
 
 def nis(whitened_innovation: Float[Tensor, "*batch measurement"]) -> Float[Tensor, "*batch"]:

@@ -15,6 +15,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lsvision.estimation.square_root import ordered_sum
+from lsvision.estimation.triangular import apply
 
 Function = Callable[[Tensor], Tensor]
 """Takes points ``(points, *batch, state)`` to values ``(points, *batch, measurement)``; parameters ``(*batch, ..)``."""
@@ -39,7 +40,7 @@ def slr(
     center, odd, even = sigma_moments(h, mean.movedim(-1, 0), chol.movedim((-2, -1), (0, 1)))
     odd, even = (part.movedim((0, 1), (-2, -1)) for part in (odd, even))
     A = torch.linalg.solve_triangular(chol, odd, upper=False, left=False)
-    return A, center.movedim(0, -1) - (A @ mean[..., None])[..., 0], even
+    return A, center.movedim(0, -1) - apply(A, mean), even
 
 
 def sigma_moments(

@@ -18,6 +18,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from lsvision.estimation.cubature import Function, slr
+from lsvision.estimation.triangular import apply, lower_factor, solve_upper, upper_root
 
 # A step may raise the cost (twice a negative log density) by this much before it is halved: less than the posterior's
 # own scatter, more than what separates the posterior's mean from its mode.
@@ -80,7 +81,7 @@ def whitened_rows(
     blocks = torch.where(valid[..., None, None], blocks, 0.0).flatten(-3, -2)
     unit = torch.eye(latents, blocks.shape[-1], dtype=A.dtype, device=A.device)
     stacked = torch.cat([unit.expand(*blocks.shape[:-2], latents, -1), blocks], dim=-2)
-    root = torch.linalg.qr(stacked, mode="r").R
+    root = upper_root(stacked)
     by_latents = root[..., :latents, :latents].diagonal(dim1=-2, dim2=-1).abs().log().sum(-1)
     by_noise = noise_chol.diagonal(dim1=-2, dim2=-1).log().sum(-1)
     log_det = 2 * (by_latents + torch.where(valid, by_noise, 0.0).sum(-1))
@@ -104,7 +105,7 @@ def measurement(
 
     def linearise(mean: Tensor, factor: Tensor) -> Rows:
         A, b, error = slr(lambda x: h(x).flatten(-2), mean, lower_factor(factor))
-        residual = measured - ((A @ mean[..., None])[..., 0] + b).unflatten(-1, (blocks, size))
+        residual = measured - (apply(A, mean) + b).unflatten(-1, (blocks, size))
         residual = torch.where(valid[..., None], residual, 0.0)
         A, error = (matrix.unflatten(-2, (blocks, size)) for matrix in (A, error))
         return whitened_rows(A, residual, error, noise_chol(mean), valid)
@@ -157,27 +158,21 @@ def iterated_update(
     return Posterior(mean, factor, torch.stack(path), iterations, ~failed & ~running, info)
 
 
-def lower_factor(factor: Float[Tensor, "*batch state columns"]) -> Float[Tensor, "*batch state state"]:
-    """Lower triangular L, diagonal not negative, with L Lᵀ = factor factorᵀ."""
-    lower = torch.linalg.qr(factor.mT, mode="r").R.mT
-    return lower * torch.where(lower.diagonal(dim1=-2, dim2=-1) < 0, -1.0, 1.0)[..., None, :]
-
-
 def _cost(rows: Rows, mean: Tensor, prior_mean: Tensor, prior_root: Tensor) -> Tensor:
     """Twice the negative log density of the measurements and the prior at ``mean``, but for a constant."""
-    from_prior = (prior_root @ (mean - prior_mean)[..., None])[..., 0]
+    from_prior = apply(prior_root, mean - prior_mean)
     return rows.matrix[..., -1].square().sum(-1) + from_prior.square().sum(-1) + rows.log_det
 
 
 def _solve(rows: Rows, mean: Tensor, prior_mean: Tensor, prior_root: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Mean, covariance factor and information root of the posterior under the linearised measurements."""
-    to_prior = prior_root @ (prior_mean - mean)[..., None]
+    to_prior = apply(prior_root, prior_mean - mean)[..., None]
     stacked = torch.cat([torch.cat([prior_root, to_prior], -1).expand(*mean.shape[:-1], -1, -1), rows.matrix], -2)
-    triangle = torch.linalg.qr(stacked, mode="r").R
+    triangle = upper_root(stacked)
     state = mean.shape[-1]
     root, right = triangle[..., :state, :state], triangle[..., :state, state:]
     eye = torch.eye(state, dtype=mean.dtype, device=mean.device).expand_as(root)
-    solution = torch.linalg.solve_triangular(root, torch.cat([eye, right], -1), upper=True)
+    solution = solve_upper(root, torch.cat([eye, right], -1))
     return mean + solution[..., state], solution[..., :state], root
 
 
@@ -207,7 +202,7 @@ def _divergence(move: Tensor, root: Tensor, old_factor: Tensor) -> Tensor:
     """Kullback-Leibler divergence, nats, of the old Gaussian from the new one (information root, upper triangular)."""
     ratio = root @ old_factor
     log_det = _log_diagonal(root) + _log_diagonal(old_factor)
-    distance = (root @ move[..., None])[..., 0].square().sum(-1)
+    distance = apply(root, move).square().sum(-1)
     return (ratio.square().sum((-2, -1)) - move.shape[-1] + distance) / 2 - log_det
 
 

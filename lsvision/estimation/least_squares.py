@@ -11,6 +11,8 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.func import jacfwd
 
+from lsvision.estimation.triangular import apply, solve_upper, upper_root
+
 _FIRST_DAMPING = 1e-6  # of the Jacobian's columns, scaled to unit length
 _LARGEST_DAMPING = 1e8
 
@@ -54,14 +56,14 @@ def levenberg_marquardt(
         iterations = iterations + running
         path.append(state)
         damping = torch.where(better, damping / 10, damping * 10)
-        length = (jacobian @ step[..., None]).square().sum((-2, -1)).sqrt()
+        length = apply(jacobian, step).square().sum(-1).sqrt()
         settled = (length <= tolerance) & (damping <= 1)  # a step that damping made short says nothing
         running = running & ~settled & (damping < _LARGEST_DAMPING)
         if not bool(running.any()):
             break
-    root = torch.linalg.qr(_batch_jacobian(residual, state), mode="r").R
+    root = upper_root(_batch_jacobian(residual, state))
     eye = torch.eye(state.shape[-1], dtype=state.dtype, device=state.device).expand_as(root)
-    factor = torch.linalg.solve_triangular(root, eye, upper=True)
+    factor = solve_upper(root, eye)
     converged = ~running & (damping < _LARGEST_DAMPING) & torch.isfinite(values).all(-1)
     return LeastSquares(state, factor, torch.stack(path), iterations, converged)
 
@@ -71,9 +73,9 @@ def _damped_step(jacobian: Tensor, values: Tensor, damping: Tensor) -> Tensor:
     lengths = torch.linalg.vector_norm(jacobian, dim=-2)
     weight = torch.diag_embed(lengths * damping.sqrt()[..., None])
     right = torch.cat([-values, torch.zeros_like(lengths)], dim=-1)
-    triangle = torch.linalg.qr(torch.cat([torch.cat([jacobian, weight], -2), right[..., None]], -1), mode="r").R
+    triangle = upper_root(torch.cat([torch.cat([jacobian, weight], -2), right[..., None]], -1))
     size = lengths.shape[-1]
-    return torch.linalg.solve_triangular(triangle[..., :size, :size], triangle[..., :size, size:], upper=True)[..., 0]
+    return solve_upper(triangle[..., :size, :size], triangle[..., :size, size:])[..., 0]
 
 
 def _batch_jacobian(residual: Callable[[Tensor], Tensor], state: Tensor) -> Tensor:

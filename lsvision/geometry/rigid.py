@@ -75,7 +75,9 @@ def fit_rigid(
     weight = weight / seen[..., None, :].clamp(min=1)
     source, target = (torch.where(weight > 0, points, 0.0) for points in (source, target))
     source_mean, target_mean = (weight * source).sum(-2), (weight * target).sum(-2)
-    covariance = (weight * (target - target_mean[..., None, :])).mT @ (source - source_mean[..., None, :])
+    from_target, from_source = weight * (target - target_mean[..., None, :]), source - source_mean[..., None, :]
+    # A sum, not a matrix product: the last bits of that depend on where in a batch the points lie.
+    covariance = (from_target[..., :, None] * from_source[..., None, :]).sum(-3)
     u, _, vh = torch.linalg.svd(covariance)
     sign = torch.ones_like(u[..., 0])
     sign[..., 2] = torch.linalg.det(u @ vh).sign()

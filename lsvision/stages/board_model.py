@@ -19,7 +19,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from lsvision.estimation import Rows, lower_factor, slr, whitened_rows
+from lsvision.estimation import Rows, apply, lower_factor, slr, upper_root, whitened_rows
 from lsvision.geometry import displace, fit_rigid, rotation_from_vector, scan_position, transform
 
 # Spread, rad and mm, of cubature points that stand for one point: the model there is its tangent to ten digits.
@@ -129,7 +129,7 @@ def linearise(
 def corner_rows(
     problem: BoardProblem, mean: Float[Tensor, "*batch state"], factor: Float[Tensor, "*batch state columns"]
 ) -> Float[Tensor, "*batch boards corners 3 columns"]:
-    """Whitened rows ``[A | r]`` of each corner by itself about a Gaussian state, for a filter that takes them in turn."""
+    """Whitened rows ``[A | r]`` of each corner alone, about a Gaussian state: for a filter that takes them in turn."""
     A, error, residual = _measured_model(problem, mean, factor)
     columns = torch.cat([error, A, residual[..., None]], dim=-1)
     columns = torch.linalg.solve_triangular(problem.noise_chol, columns, upper=False)
@@ -145,7 +145,7 @@ def motion_information(problem: BoardProblem, state: Float[Tensor, "*batch state
     size = state.shape[-1]
     spread = POINT_SPREAD * torch.eye(size, dtype=state.dtype, device=state.device)
     rows = linearise(problem, state, spread.expand(*state.shape, size)).matrix[..., :-1]
-    root = torch.linalg.qr(rows, mode="r").R[..., -3:, -3:]
+    root = upper_root(rows)[..., -3:, -3:]
     return root.mT @ root
 
 
@@ -157,7 +157,7 @@ def rotations(problem: BoardProblem, state: Float[Tensor, "*batch state"]) -> Fl
 def translations(problem: BoardProblem, state: Float[Tensor, "*batch state"]) -> Float[Tensor, "*batch boards 3"]:
     """Translations T of the boards, mm: where the board frames' origins lie."""
     position = split_state(state)[1]
-    return position - (rotations(problem, state) @ problem.centroid[..., None])[..., 0]
+    return position - apply(rotations(problem, state), problem.centroid)
 
 
 def _turned(problem: BoardProblem, theta: Tensor) -> Tensor:
@@ -180,7 +180,7 @@ def _measured_model(problem: BoardProblem, mean: Tensor, factor: Tensor) -> tupl
     """
     theta, position, n = split_state(mean)
     A, b, error = slr(lambda vector: _turned(problem, vector), theta, _theta_chol(problem, factor))
-    turned = ((A @ theta[..., None])[..., 0] + b).unflatten(-1, (-1, 3))
+    turned = (apply(A, theta) + b).unflatten(-1, (-1, 3))
     predicted = scan_position(turned + position[..., None, :], n[..., None, None, :])
     eye = torch.eye(3, dtype=mean.dtype, device=mean.device).expand(*predicted.shape, 3)
     moves = torch.cat(
@@ -204,6 +204,6 @@ def _pitch_row(problem: BoardProblem, pitch: MountingPitch, mean: Tensor, factor
     """The one whitened row of a known mounting pitch of a single board, whose theta comes first in the state."""
     theta = split_state(mean)[0]
     A, b, _ = slr(lambda vector: _pitch_angle(problem, vector)[..., None], theta, _theta_chol(problem, factor))
-    expected = (A @ theta[..., None])[..., 0] + b
+    expected = apply(A, theta) + b
     row = torch.cat([A[..., 0, :], A.new_zeros(*A.shape[:-2], 6), pitch.angle - expected], dim=-1)
     return row / pitch.sigma

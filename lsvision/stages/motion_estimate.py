@@ -16,6 +16,7 @@ from lsvision.estimation import (
     Info,
     Posterior,
     Rows,
+    apply,
     filter_sequence,
     iterated_update,
     levenberg_marquardt,
@@ -118,7 +119,7 @@ def sequential(problem: BoardProblem, start: Float[Tensor, "*batch state"], conf
     for _ in range(config.max_iterations):
         rows = rows_order(corner_rows(problem, mean, factor))
         track = filter_sequence(
-            lambda points, step, A=rows[..., :-1]: (A[step] @ points[..., None])[..., 0],
+            lambda points, step, A=rows[..., :-1]: apply(A[step], points.contiguous()),
             start - mean,
             _wide_chol(start, config),
             rows[..., -1],
@@ -146,7 +147,7 @@ def least_squares(problem: BoardProblem, start: Float[Tensor, "*batch state"], c
     root = prior_root(start, config)
 
     def residual(state: Tensor) -> Tensor:
-        from_prior = (root @ (state - start)[..., None])[..., 0]
+        from_prior = apply(root, state - start)
         return torch.cat([whitened_residuals(problem, state), from_prior], dim=-1)
 
     solution = levenberg_marquardt(residual, start, max_iterations=config.max_iterations)
