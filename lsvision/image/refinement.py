@@ -20,7 +20,7 @@ def refine_disparity(
 
     In a window around each pixel the right image, warped by the current disparity, is shifted so that it fits the left
     one best; brightness may differ by an offset. Semi-global matching interpolates its costs, which pulls disparities
-    towards whole pixels; this does not. Where the window's texture is weaker than the noise, the disparity stays.
+    towards whole pixels; this does not. Where a window has no texture, the disparity stays.
 
     Args:
         left, right: grey values of the pair.
@@ -28,27 +28,35 @@ def refine_disparity(
         noise: standard deviation of the grey values' noise, on their scale.
         largest_change_px: a larger total change is not believed and undone.
 
-    Source: Lucas & Kanade 1981, in one dimension.
+    Source: Lucas & Kanade 1981, in one dimension; Baker & Matthews 2004 for the slope of the image that is not warped.
     """
     known = torch.isfinite(disparity)
     start = torch.where(known, disparity, 0.0)
-    current = _filled_mean(start, known, window)
-    left_detail = left - _mean(left, window)
+    weight = known.to(left.dtype)
+    share = _mean(weight, window).clamp(min=0.5 / window**2)
+
+    def mean(values: Tensor) -> Tensor:
+        """Mean over the pixels of a window whose disparity is known."""
+        return _mean(weight * values, window) / share
+
+    current = mean(start)
+    left_detail = left - mean(left)
+    # The left image's slope: its noise is independent of the right one's, which interpolation smooths between pixels,
+    # and a slope that shares that noise would pull disparities towards the middle between them.
+    slope = F.pad(left[:, 2:] - left[:, :-2], (1, 1)) / 2
+    slope = slope - mean(slope)
+    # The window's mean of noise times slope; the prior keeps untextured ground where matching put it.
+    energy = mean(slope.square()) + 4.0 * noise**2 / window**2
     for _ in range(iterations):
-        warped, slope = _warp_rows(right, current)
-        residual = left_detail - (warped - _mean(warped, window))
-        slope = slope - _mean(slope, window)
-        energy = _mean(slope.square(), window)
-        # The window's mean of noise times slope; the prior keeps untextured ground where matching put it.
-        floor = 4.0 * noise**2 / window**2
-        change = -_mean(slope * residual, window) / (energy + floor)
-        current = current + change.clamp(-0.5, 0.5)
+        warped = _warp_rows(right, current)
+        residual = left_detail - (warped - mean(warped))
+        current = current - (mean(slope * residual) / energy).clamp(-0.5, 0.5)
     believable = known & ((current - start).abs() <= largest_change_px)
     return torch.where(believable, current, disparity)
 
 
-def _warp_rows(image: Tensor, disparity: Tensor) -> tuple[Tensor, Tensor]:
-    """Values and slopes of an image at u - disparity along each line, by Catmull-Rom interpolation."""
+def _warp_rows(image: Tensor, disparity: Tensor) -> Tensor:
+    """Values of an image at u - disparity along each line, by Catmull-Rom interpolation."""
     width = image.shape[1]
     position = (torch.arange(width, dtype=disparity.dtype) - disparity).clamp(1.0, width - 2.0)
     base = position.floor().clamp(max=width - 3)
@@ -56,9 +64,7 @@ def _warp_rows(image: Tensor, disparity: Tensor) -> tuple[Tensor, Tensor]:
     index = base.long()
     a, b, c, d = (image.gather(1, index + shift) for shift in (-1, 0, 1, 2))
     linear, quadratic, cubic = c - a, 2 * a - 5 * b + 4 * c - d, 3 * (b - c) + d - a
-    value = b + 0.5 * t * (linear + t * (quadratic + t * cubic))
-    slope = 0.5 * (linear + t * (2 * quadratic + 3 * t * cubic))
-    return value, slope
+    return b + 0.5 * t * (linear + t * (quadratic + t * cubic))
 
 
 def _mean(values: Tensor, window: int) -> Tensor:
@@ -66,9 +72,3 @@ def _mean(values: Tensor, window: int) -> Tensor:
     pad = window // 2
     across = F.avg_pool2d(values[None], (1, window), 1, (0, pad), count_include_pad=False)
     return F.avg_pool2d(across, (window, 1), 1, (pad, 0), count_include_pad=False)[0]
-
-
-def _filled_mean(values: Tensor, known: Tensor, window: int) -> Tensor:
-    """Mean over the known values of a window; the values themselves where the window holds none."""
-    share = _mean(known.to(values.dtype), window)
-    return torch.where(share > 0, _mean(values, window) / share.clamp(min=1e-6), values)
