@@ -57,13 +57,14 @@ def match_sgbm(
         mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY,
     )
     # Columns within the range of the image's edge have no partner for some disparities and SGBM leaves them out:
-    # a mirrored-free margin of the edge's own value gives them one.
-    before, after = max(maximum_px + 1, 0), max(-minimum_px + 1, 0)
+    # a margin of the edge's own value gives them one.
+    before, after = max(minimum_px + count, 0), max(-minimum_px + 1, 0)
     pair = [_padded(_bytes(image), before, after) for image in (left, right)]
     steps = torch.from_numpy(matcher.compute(pair[0].numpy(), pair[1].numpy()))[:, before : before + left.shape[1]]
     disparity = steps.to(torch.float32) / _SUBPIXEL_STEPS
     partner = torch.arange(left.shape[1]) - disparity
-    seen = (disparity >= minimum_px) & (partner >= 0) & (partner <= left.shape[1] - 1)
+    in_range = (disparity > minimum_px - 1) & (disparity < maximum_px + 1)
+    seen = in_range & (partner >= 0) & (partner <= left.shape[1] - 1)
     return torch.where(seen, disparity, torch.nan)
 
 
