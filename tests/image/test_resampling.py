@@ -1,0 +1,80 @@
+"""Sampling strips: exact on the grid, right between, the same for any number of threads and any strip."""
+
+import pytest
+import torch
+
+from lsvision.image.resampling import sample_image
+
+
+def positions(lines: int, width: int) -> tuple[torch.Tensor, torch.Tensor]:
+    line, column = torch.meshgrid(torch.arange(lines).double(), torch.arange(width).double(), indexing="ij")
+    return column, line
+
+
+@pytest.mark.parametrize("mode", ["bilinear", "bicubic"])
+@pytest.mark.parametrize("dtype", [torch.uint8, torch.uint16])
+def test_identity_is_exact(dtype, mode):
+    image = torch.randint(0, torch.iinfo(dtype).max + 1, (40, 33, 3)).to(dtype)
+    sampled = sample_image(image, *positions(40, 33), mode)
+    assert sampled.dtype == dtype
+    assert torch.equal(sampled.int(), image.int())
+
+
+def test_half_pixels_by_hand():
+    image = torch.tensor([[0, 100, 200], [40, 60, 80]], dtype=torch.uint8)[..., None]
+    column, line = torch.tensor([[0.5, 1.5, 1.0]]).double(), torch.tensor([[0.0, 0.5, 0.5]]).double()
+    assert sample_image(image, column, line, "bilinear").flatten().tolist() == [50, 110, 80]
+    # Catmull-Rom-like cubic of a = -0.75 halfway: weights -3/32, 19/32, 19/32, -3/32 on 0, 8, 24, 16.
+    row = torch.tensor([[0.0, 8.0, 24.0, 16.0]])[..., None]
+    halfway = sample_image(row, torch.tensor([[1.5]]).double(), torch.zeros(1, 1).double(), "bicubic")
+    assert halfway.item() == (19 * (8 + 24) - 3 * (0 + 16)) / 32
+
+
+def test_bilinear_equals_the_naive_sum():
+    image = torch.rand(12, 17, 2)
+    column, line = 16 * torch.rand(9, 5).double(), 11 * torch.rand(9, 5).double()
+    sampled = sample_image(image, column, line, "bilinear")
+    for i in range(9):
+        for j in range(5):
+            u, v = float(column[i, j]), float(line[i, j])
+            a, b = min(int(u), 15), min(int(v), 10)
+            s, t = u - a, v - b
+            upper = (1 - s) * image[b, a] + s * image[b, a + 1]
+            lower = (1 - s) * image[b + 1, a] + s * image[b + 1, a + 1]
+            torch.testing.assert_close(sampled[i, j], (1 - t) * upper + t * lower, rtol=0, atol=2e-3)
+
+
+@pytest.mark.parametrize("mode", ["bilinear", "bicubic"])
+def test_beyond_the_rim_is_the_rim_and_nan_is_zero(mode):
+    image = torch.randint(1, 256, (5, 6, 3)).to(torch.uint8)
+    column = torch.tensor([[-3.0, 9.0, 2.0, torch.nan, 1.0]]).double()
+    line = torch.tensor([[1.0, 1.0, 40.0, 1.0, torch.nan]]).double()
+    sampled = sample_image(image, column, line, mode)[0]
+    assert torch.equal(sampled, torch.stack([image[1, 0], image[1, 5], image[4, 2], 0 * image[0, 0], 0 * image[0, 0]]))
+
+
+def test_overshoot_is_clamped():
+    image = torch.tensor([0, 0, 255, 255], dtype=torch.uint8).reshape(1, 4, 1)
+    column = torch.linspace(0, 3, 31).double()[None]
+    sampled = sample_image(image, column, torch.zeros_like(column), "bicubic").flatten()
+    assert (sampled.int().diff() >= -20).all()  # no wrap from 255 to 0
+    assert sampled[-1] == 255
+
+
+@pytest.mark.parametrize("mode", ["bilinear", "bicubic"])
+def test_threads_change_no_bit(mode):
+    image = torch.randint(0, 65536, (50, 60, 3)).to(torch.uint16)
+    column, line = 59 * torch.rand(37, 41).double(), 49 * torch.rand(37, 41).double()
+    single = sample_image(image, column, line, mode)
+    torch.set_num_threads(2)
+    assert torch.equal(sample_image(image, column, line, mode).int(), single.int())
+
+
+@pytest.mark.parametrize("mode", ["bilinear", "bicubic"])
+def test_strip_around_a_position_changes_no_bit(mode):
+    image = torch.randint(0, 65536, (300, 700, 1)).to(torch.uint16)
+    column, line = 699 * torch.rand(100, 300).double(), 110 + 80 * torch.rand(100, 300).double()
+    whole = sample_image(image, column, line, mode)
+    for start, stop in ((100, 200), (3, 261), (107, 194)):
+        part = sample_image(image[start:stop], column, line - start, mode)
+        assert torch.equal(part.int(), whole.int())
