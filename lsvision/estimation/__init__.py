@@ -2,6 +2,7 @@
 
 from lsvision.estimation.consistency import mean_chi_square_band, nees, nis
 from lsvision.estimation.cubature import slr
+from lsvision.estimation.derivative import jacobian
 from lsvision.estimation.filtering import Track, Update, filter_sequence, predict, update
 from lsvision.estimation.information import (
     cramer_rao_bound,
@@ -11,6 +12,7 @@ from lsvision.estimation.information import (
 )
 from lsvision.estimation.joint import Info, Posterior, Rows, iterated_update, measurement, whitened_rows
 from lsvision.estimation.least_squares import LeastSquares, levenberg_marquardt
+from lsvision.estimation.rotation import recentre
 from lsvision.estimation.smoothing import smooth
 from lsvision.estimation.triangular import apply, lower_factor, solve_upper, upper_root
 
@@ -26,6 +28,7 @@ __all__ = [
     "filter_sequence",
     "fisher_information",
     "iterated_update",
+    "jacobian",
     "levenberg_marquardt",
     "lower_factor",
     "marginal_information",
@@ -34,6 +37,7 @@ __all__ = [
     "nees",
     "nis",
     "predict",
+    "recentre",
     "slr",
     "smooth",
     "solve_upper",

@@ -173,7 +173,7 @@ def _update(
     root, _ = absorb(noise, even)
     root, remainder = absorb(root, odd, factor)
     root, gain = root[: len(measured)], root[len(measured) :]
-    whitened = forward_substitute(root, innovation)
+    whitened = forward_substitute(root, innovation[:, None])[:, 0]
     for column, part in zip(gain.unbind(1), whitened, strict=True):
         mean = torch.addcmul(mean, column, part)
     return mean, remainder, innovation, root, whitened

@@ -8,7 +8,8 @@ from collections.abc import Callable
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.func import jacfwd
+
+from lsvision.estimation.derivative import jacobian
 
 
 def fisher_information(
@@ -20,7 +21,7 @@ def fisher_information(
         whitened_residual: takes ``(state,)`` to measured less predicted values in standard deviations, any shape. What
             is known before the measurements has no part in it.
     """
-    J = jacfwd(whitened_residual)(state).flatten(0, -2)
+    J = jacobian(whitened_residual, state).flatten(0, -2)
     return J.mT @ J
 
 

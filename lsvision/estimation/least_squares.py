@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
-from torch.func import jacfwd
 
+from lsvision.estimation.derivative import jacobian as jacobian_of
 from lsvision.estimation.triangular import apply, solve_upper, upper_root
 
 _FIRST_DAMPING = 1e-6  # of the Jacobian's columns, scaled to unit length
@@ -44,7 +44,7 @@ def levenberg_marquardt(
     state, values, path = start, residual(start), [start]
     damping = torch.full_like(start[..., 0], _FIRST_DAMPING)
     running = torch.isfinite(values).all(-1)
-    iterations = torch.zeros_like(running, dtype=torch.long)
+    iterations, converged = torch.zeros_like(running, dtype=torch.long), torch.zeros_like(running)
     for _ in range(max_iterations):
         jacobian = _batch_jacobian(residual, state)
         step = _damped_step(jacobian, values, damping)
@@ -58,13 +58,13 @@ def levenberg_marquardt(
         damping = torch.where(better, damping / 10, damping * 10)
         length = apply(jacobian, step).square().sum(-1).sqrt()
         settled = (length <= tolerance) & (damping <= 1)  # a step that damping made short says nothing
+        converged = converged | (running & settled)
         running = running & ~settled & (damping < _LARGEST_DAMPING)
         if not bool(running.any()):
             break
     root = upper_root(_batch_jacobian(residual, state))
     eye = torch.eye(state.shape[-1], dtype=state.dtype, device=state.device).expand_as(root)
     factor = solve_upper(root, eye)
-    converged = ~running & (damping < _LARGEST_DAMPING) & torch.isfinite(values).all(-1)
     return LeastSquares(state, factor, torch.stack(path), iterations, converged)
 
 
@@ -84,4 +84,4 @@ def _batch_jacobian(residual: Callable[[Tensor], Tensor], state: Tensor) -> Tens
     One column a direction, the same for all problems: J e_i is the derivative along e_i.
     """
     offset = torch.zeros_like(state[(0,) * (state.ndim - 1)])
-    return jacfwd(lambda move: residual(state + move))(offset)
+    return jacobian_of(lambda move: residual(state + move), offset)

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from lsvision.estimation.cubature import Function, sigma_moments
 from lsvision.estimation.filtering import Track
-from lsvision.estimation.square_root import absorb, forward_substitute
+from lsvision.estimation.square_root import absorb, forward_substitute, ordered_sum
 
 
 def smooth(
@@ -51,6 +51,6 @@ def _step_back(
     root, remainder = absorb(process, deviations, own)
     size = len(mean)
     whitened = forward_substitute(root[:size], torch.cat([(next_mean - predicted)[:, None], next_factor], dim=1))
-    gained = (root[size:, :, None] * whitened[None]).sum(1)
+    gained = ordered_sum(root[size:, :, None] * whitened)[:, 0]
     smoothed_factor, _ = absorb(torch.zeros_like(process), torch.cat([gained[:, 1:], remainder], dim=1))
     return mean + gained[:, 0], smoothed_factor

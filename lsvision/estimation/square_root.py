@@ -29,11 +29,11 @@ def absorb(
 
 
 def forward_substitute(
-    L: Float[Tensor, "rows rows *batch"], right: Float[Tensor, "rows *batch"]
-) -> Float[Tensor, "rows *batch"]:
+    L: Float[Tensor, "rows rows *batch"], right: Float[Tensor, "rows columns *batch"]
+) -> Float[Tensor, "rows columns *batch"]:
     """Solution of L x = right for a lower triangular L."""
     if L.ndim == 2:
-        return torch.linalg.solve_triangular(L, right[:, None], upper=False)[:, 0]
+        return torch.linalg.solve_triangular(L, right, upper=False)
     solution: list[Tensor] = []
     for k in range(len(right)):
         rest = right[k]

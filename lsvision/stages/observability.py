@@ -19,7 +19,7 @@ from lsvision.types import Observability, ObservedDirection
 # then at most half the prior's.
 OBSERVED_SHARE = 0.5
 # Tilts to choose from. Past 15 degrees the inner corners of a 360 x 270 mm board leave a depth range of 52 mm.
-TILT_GRID_DEG = (-15.0, -10.0, -5.0, 0.0, 5.0, 10.0, 15.0)
+TILT_GRID_DEG = (-15.0, -10.0, 0.0, 10.0, 15.0)
 
 _NEARLY_ONE = 0.95  # a direction is named after its component alone where that makes up this much of its length
 _AXES = ("n1 (sideways)", "n2 (stretch)", "n3 (in depth)")

@@ -1,0 +1,32 @@
+"""Normalised squares and their chi-square bands."""
+
+import pytest
+import torch
+from scipy.stats import chi2
+
+from lsvision.estimation import mean_chi_square_band, nees, nis
+from tests.estimation.models import random, random_covariance
+
+
+def test_nees_is_the_quadratic_form():
+    P, error = random_covariance(5, 4), random(5, 4)
+    expected = (error * torch.linalg.solve(P, error)).sum(-1)
+    factor = torch.linalg.cholesky(P) @ torch.linalg.qr(random(4, 4)).Q
+    torch.testing.assert_close(nees(error, factor), expected)
+
+
+def test_cubature_points_lie_at_the_size_of_the_state():
+    factor = torch.linalg.cholesky(random_covariance(9))
+    points = 3 * factor.mT
+    torch.testing.assert_close(nees(points, factor.expand(9, 9, 9)), torch.full((9,), 9.0).double())
+
+
+def test_nis_by_hand():
+    assert nis(torch.tensor([3.0, 4.0]).double()).item() == 25.0
+
+
+@pytest.mark.parametrize(("freedom", "runs", "probability"), [(9, 400, 0.95), (1, 1, 0.99), (3, 50, 0.9)])
+def test_band_is_scipys(freedom, runs, probability):
+    tail = (1 - probability) / 2
+    expected = chi2.ppf([tail, 1 - tail], freedom * runs) / runs
+    assert mean_chi_square_band(freedom, runs, probability) == pytest.approx(expected, rel=1e-8)
