@@ -151,11 +151,12 @@ def _locate(
     by_column = [(t.flip(0) if backwards else t).mT.contiguous() for t in (q_y, q_z, column, measured)]
     q_y, q_z, column, measured = by_column
     connected = (q_z.diff(dim=1).abs() <= limit) & torch.isfinite(q_z.diff(dim=1))
-    position = (q_y - (grid.origin_y_mm + rows[0] * grid.pitch_mm)) / grid.pitch_mm
+    # Whole rows and lines are taken off and put on without rounding: no bit of a row depends on the strip it lies in.
+    position = (q_y - grid.origin_y_mm) / grid.pitch_mm - rows[0]
     segment, fraction = visible_segments(position, q_z, connected, rows[1] - rows[0])
     column, q_z = (interpolate_segments(values, segment, fraction) for values in (column, q_z))
-    step = torch.where(segment >= 0, segment + fraction, torch.nan)
-    line = line[-1] - step if backwards else line[0] + step
+    line = (line[-1] - segment) - fraction if backwards else (line[0] + segment) + fraction
+    line = torch.where(segment >= 0, line, torch.nan)
     return column.mT, line.mT, q_z.mT, both_ends(measured, segment).mT
 
 
