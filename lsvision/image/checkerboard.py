@@ -114,7 +114,9 @@ def refine_grid(image: LineImage, grid: Float[Tensor, "rows columns 2"]) -> Dete
     points = grid.reshape(-1, 2)
     along_x, along_y = _neighbour_vectors(grid)
     spacing = torch.minimum(along_x.norm(dim=-1), along_y.norm(dim=-1)).min()
-    radius = int((0.35 * spacing).clamp(3, 16))  # a longer run of an edge along the pixels tells more of it
+    # Edges along the pixels need a long run; past it the board's own texture, which the covariance takes for white
+    # noise, weighs more than what is gained.
+    radius = int((0.35 * spacing).clamp(3, 13))
     centre = points.round().long()
     windows, inside = _windows(image, centre, radius)
     # The edge along X has its normal a quarter turn from the tangent along X.
