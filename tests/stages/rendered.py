@@ -1,0 +1,44 @@
+"""Small rendered scans in memory, and the truth about their corners."""
+
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from lsvision.geometry import scan_position, transform
+from lsvision.simulation import EncoderConfig, MotionConfig, SceneConfig, SensorConfig, Simulation, scaled_rig, simulate
+from lsvision.types import Board, Rig, Scan, TensorImage, Transport
+
+FULL_RIG = Rig(7142, 10.0, 113.84, 354.0, 1042.0, 6099.0)
+SMALL_RIG = scaled_rig(FULL_RIG, 16)
+PITCH = 1.12
+BOARD = Board(12, 9, 30.0)
+MOTION = MotionConfig(angle_x_deg=-1.5, angle_z_deg=0.8, stretch=1.0246)
+TILTED = SceneConfig(pitch_deg=6.0, roll_deg=-4.0, yaw_deg=92.0)
+FINE_SENSOR = SensorConfig(supersampling=2)
+
+
+def simulation(
+    scene: SceneConfig = TILTED, transport: Transport = "forward", encoder: EncoderConfig | None = None
+) -> Simulation:
+    """A board or sheet under the small rig, in motion."""
+    return simulate(SMALL_RIG, BOARD, scene, MOTION, FINE_SENSOR, PITCH, transport=transport, encoder=encoder)
+
+
+def stereo_scan(source: Simulation) -> Scan:
+    """The scan with both its images."""
+    left, right = (TensorImage(torch.cat(list(source.strips(camera)))) for camera in ("left", "right"))
+    return Scan(Path("rendered"), source.rig, source.travel, left, right, None)
+
+
+def depth_scan(source: Simulation) -> Scan:
+    """The scan as a camera that computes depth itself would store it."""
+    left = TensorImage(torch.cat(list(source.strips("left"))))
+    depth = TensorImage(torch.cat(list(source.depth_strips()))[..., None])
+    return Scan(Path("rendered"), source.rig, source.travel, left, None, depth)
+
+
+def true_measurement(source: Simulation) -> Tensor:
+    """True (x, travel, z), mm, of the board's corners."""
+    points = transform(source.pose.rotation, source.pose.translation, BOARD.corner_points())
+    return scan_position(points, source.trajectory.n)

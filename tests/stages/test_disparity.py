@@ -1,0 +1,98 @@
+"""Disparity and depth of strips: the search range, reads of any range, and the height of a rendered plane."""
+
+import dataclasses
+import math
+from pathlib import Path
+
+import pytest
+import torch
+
+from lsvision.geometry import triangulate
+from lsvision.image.matching import match_sgbm
+from lsvision.simulation import SceneConfig
+from lsvision.stages.disparity import DisparityConfig, MatchedDepth, depth_from_disparity, depth_of, disparity_range
+from lsvision.types import Scan, TensorImage, Travel
+from tests.stages.rendered import FULL_RIG, PITCH, SMALL_RIG, simulation, stereo_scan
+
+CONFIG = DisparityConfig(strip_lines=64, halo_lines=16)
+
+
+@pytest.fixture(scope="module")
+def sheet():
+    source = simulation(SceneConfig("sheet", pitch_deg=2.0, roll_deg=1.5, texture_mm=1.5, margin_mm=0.0))
+    return source, stereo_scan(source)
+
+
+def test_default_range_is_that_of_the_camera():
+    low, high = disparity_range(FULL_RIG, DisparityConfig())
+    assert abs(low + 165) <= 1
+    assert abs(high - 165) <= 1
+    small = disparity_range(SMALL_RIG, DisparityConfig())
+    assert small == (math.floor(low / 16), math.ceil(high / 16))
+
+
+def test_depth_equals_triangulation_pixel_by_pixel():
+    disparity = torch.tensor([[0.0, 3.5, torch.nan, -7.25]])
+    depth = depth_from_disparity(disparity, SMALL_RIG)
+    assert depth.dtype == torch.float32
+    assert depth[0, 0] == pytest.approx(SMALL_RIG.zero_disparity_mm)
+    for column, value in enumerate(disparity[0].double()):
+        expected = triangulate(SMALL_RIG, torch.tensor(float(column)).double(), value)[1]
+        torch.testing.assert_close(depth[0, column].double(), expected, rtol=1e-6, atol=0, equal_nan=True)
+
+
+def test_values_do_not_depend_on_the_range_read(sheet):
+    scan = sheet[1]
+    whole = MatchedDepth(scan, CONFIG).read(0, scan.lines)
+    assert whole.shape == (scan.lines, SMALL_RIG.width_px, 1)
+    lazy = MatchedDepth(scan, CONFIG, kept_strips=2)
+    for start, stop in ((0, 5), (60, 70), (100, 200), (63, 64), (scan.lines - 3, scan.lines), (10, 12)):
+        torch.testing.assert_close(lazy.read(start, stop), whole[start:stop], rtol=0, atol=0, equal_nan=True)
+        assert len(lazy._strips) <= 2
+
+
+def test_height_of_a_rendered_plane(sheet):
+    source, scan = sheet
+    depth = MatchedDepth(scan, CONFIG).read(0, scan.lines)[..., 0]
+    truth = torch.cat(list(source.depth_strips()))
+    inside = (slice(40, -40), slice(80, -80))
+    error_px = to_disparity(depth, truth)[inside]
+    assert torch.isfinite(error_px).float().mean() > 0.95
+    error_px = error_px[torch.isfinite(error_px)]
+    assert error_px.square().mean().sqrt() < 0.05
+    assert abs(error_px.mean()) < 0.01
+
+
+def to_disparity(depth, truth):
+    """Error of depths in pixels of disparity."""
+    scale = SMALL_RIG.focal_length_px * SMALL_RIG.baseline_mm
+    return scale / depth.double() - scale / truth.double()
+
+
+def test_no_refinement_is_the_matcher_alone(sheet):
+    scan = sheet[1]
+    left, right = scan.left.read(0, 64), scan.right.read(0, 64)
+    config = dataclasses.replace(CONFIG, refine_iterations=0, strip_lines=64, halo_lines=0)
+    low, high = disparity_range(SMALL_RIG, config)
+    expected = match_sgbm(
+        left,
+        right,
+        minimum_px=low,
+        maximum_px=high,
+        block_size=5,
+        lambda1=8.0,
+        lambda2=32.0,
+        left_right_check_px=10,
+        uniqueness_percent=5,
+        speckle_px=100,
+    )
+    depth = MatchedDepth(scan, config).read(0, 64)[..., 0]
+    torch.testing.assert_close(depth, depth_from_disparity(expected, SMALL_RIG), equal_nan=True)
+
+
+def test_own_depth_comes_first():
+    image = TensorImage(torch.zeros(4, SMALL_RIG.width_px, 1, dtype=torch.uint8))
+    depth = TensorImage(torch.full((4, SMALL_RIG.width_px, 1), 800.0))
+    scan = Scan(Path("both"), SMALL_RIG, Travel(PITCH), image, image, depth)
+    assert depth_of(scan, CONFIG) is depth
+    assert isinstance(depth_of(dataclasses.replace(scan, depth=None), CONFIG), MatchedDepth)
