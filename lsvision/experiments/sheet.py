@@ -102,7 +102,7 @@ def _find(
     """Positions (column, row) of patches of the artwork near where they are expected, px, and which were found."""
     span = torch.arange(-_PATCH_PX, _PATCH_PX + 1, dtype=torch.float64)
     offset = torch.stack(torch.meshgrid(span, span, indexing="xy"), dim=-1)
-    centre = expected.round()
+    centre = expected.round()  # patches are drawn on whole pixels, so that a match is a shift of the expected place
     patches = gray(artwork(scene, to_sheet(centre[:, None, None] + offset)).flatten(0, 1)).reshape(
         -1, *offset.shape[:2]
     )
@@ -115,7 +115,7 @@ def _find(
         score = cv2.matchTemplate(window.numpy(), patch.to(torch.float32).numpy(), cv2.TM_CCOEFF_NORMED)
         peak = _peak(score)
         if peak is not None:
-            found[index] = centre[index] + peak - _SEARCH_PX
+            found[index] = expected[index] + peak - _SEARCH_PX
             seen[index] = True
     return found, seen
 

@@ -1,0 +1,94 @@
+"""simulate -> calibrate -> correct through files, at an eighth of the camera's pixels."""
+
+import json
+
+import pytest
+import torch
+from hydra import compose, initialize_config_dir
+from omegaconf import OmegaConf
+
+from lsvision.experiments import EXPERIMENTS
+from lsvision.experiments.settings import build_settings
+from lsvision.io import read_calibration, read_product, read_scan
+from lsvision.run import config_folder
+from lsvision.stages.correction import ProductGrid
+from lsvision.stages.measurement import measure_board
+from lsvision.types import Board, TensorImage
+
+TILTS = {"a": (2.0, 1.5, 0.0), "b": (-5.0, 1.0, 6.0), "c": (4.0, -3.0, -8.0)}
+
+
+@pytest.fixture(scope="module")
+def scans(tmp_path_factory):
+    """Three boards, scanned askew and stretched."""
+    folder = tmp_path_factory.mktemp("scans")
+    with initialize_config_dir(str(config_folder()), version_base="1.3"):
+        for name, (pitch, roll, yaw) in TILTS.items():
+            config = compose(
+                "config",
+                [
+                    "+experiment=simulate",
+                    "scale=8",
+                    f"scene.pitch_deg={pitch}",
+                    f"scene.roll_deg={roll}",
+                    f"scene.yaw_deg={yaw}",
+                    f"output={folder / name}",
+                ],
+            )
+            run, schema = EXPERIMENTS["simulate"]
+            run(build_settings(schema, OmegaConf.to_container(config, resolve=True)), folder)
+    return folder
+
+
+def test_calibrate_finds_the_motion_and_correct_makes_the_board_square(scans, command, tmp_path):
+    listed = ",".join(str(scans / name) for name in TILTS)
+    assert command("+experiment=calibrate", f"scans=[{listed}]") == 0
+    calibration = read_calibration(tmp_path / "run" / "calibration.json")
+    truth = torch.tensor(json.loads((scans / "a" / "truth.json").read_text())["n"], dtype=torch.float64)
+    error = (calibration.motion.n - truth).abs()
+    assert bool((error < 4 * calibration.motion.sigma).all())
+    assert bool((error < torch.tensor([1.5e-4, 5e-5, 5e-4])).all())
+    assert calibration.rmse_after_mm < 0.06
+    assert calibration.observability.verdict == "determined"
+    assert len(calibration.provenance.scans) == 3
+    assert (tmp_path / "run" / "report.html").is_file()
+
+    assert (
+        command(
+            "+experiment=correct",
+            f"scan={scans / 'b'}",
+            f"calibration={tmp_path / 'run' / 'calibration.json'}",
+            folder="corrected",
+        )
+        == 0
+    )
+    product = read_product(tmp_path / "corrected" / "b.zarr")
+    rows, columns = product.shape
+    grid = ProductGrid(rows, columns, product.pitch_mm, *product.origin_mm)
+    height = TensorImage(product.height(0, rows)[..., None])
+    measured = measure_board(TensorImage(product.color(0, rows)), height, grid, Board(12, 9, 30.0))
+    assert measured is not None
+    assert int(measured.valid.sum()) == 88
+    assert measured.distance_rms_mm < 0.06
+    assert (tmp_path / "corrected" / "report.html").is_file()
+    summary = json.loads((tmp_path / "corrected" / "summary.json").read_text())
+    assert summary["rows"] == rows
+    assert 0.5 < summary["valid_share"] <= 1
+
+
+def test_one_board_is_called_prior_dominated(scans, command, tmp_path, capsys):
+    assert command("+experiment=calibrate", f"scans=[{scans / 'a'}]", "calibration.method=two_step") == 0
+    calibration = read_calibration(tmp_path / "run" / "calibration.json")
+    assert calibration.observability.verdict == "prior-dominated"
+    assert calibration.improvement > 0.573
+    assert calibration.observability.advice
+    assert "not measured" in capsys.readouterr().out
+
+
+def test_a_depth_map_scan_calibrates_too(scans, command, tmp_path):
+    options = ("scale=8", "scene.pitch_deg=2", "scene.roll_deg=1.5", "depth=true", f"output={tmp_path / 'depth'}")
+    assert command("+experiment=simulate", *options) == 0
+    assert read_scan(tmp_path / "depth").right is None
+    assert command("+experiment=calibrate", f"scans=[{tmp_path / 'depth'},{scans / 'b'},{scans / 'c'}]") == 0
+    calibration = read_calibration(tmp_path / "run" / "calibration.json")
+    assert calibration.rmse_after_mm < 0.06

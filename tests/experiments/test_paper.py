@@ -1,0 +1,41 @@
+"""The paper, start to end."""
+
+import json
+
+import pytest
+
+
+def _check(summary, *, sheet_px):
+    paper, still, vibrating = summary["paper"], summary["still"], summary["vibrating"]
+    joint, two_step = still["joint"], still["two_step"]
+    floor = [abs(n - true) for n, true in zip(joint["n"], joint["n_true"], strict=True)]
+    assert joint["verdict"] == "determined"
+    assert joint["iterations"] <= 3
+    assert joint["rmse_after_mm"] <= 0.06
+    assert all(error <= bound for error, bound in zip(floor, (1.5e-4, 5e-5, 5e-4), strict=True))
+    assert all(error <= 3 * sigma for error, sigma in zip(floor, joint["sigma"], strict=True))
+    assert two_step["improvement"] > paper["improvement"]
+    assert two_step["verdict"] == "prior-dominated"
+    for method in ("joint", "two_step"):
+        assert vibrating[method]["improvement"] >= paper["improvement"]
+        assert vibrating[method]["rmse_after_mm"] == pytest.approx(paper["rmse_after_mm"], rel=0.2)
+    products = still["products"]
+    for board in products["board_distance_rms_mm"].values():
+        assert board["corners"] == 88
+        assert board["after"] <= 0.06 < 1.0 < board["before"]
+    assert products["sheet_shift_px"]["points"] > 150
+    assert products["sheet_shift_px"]["max"] <= sheet_px
+    assert products["sheet_rms_mm"]["after"] < 0.1 < 1.0 < products["sheet_rms_mm"]["before"]
+
+
+@pytest.mark.slow
+def test_the_paper_at_a_quarter_of_the_pixels(command, tmp_path):
+    assert command("+experiment=paper") == 0
+    _check(json.loads((tmp_path / "run" / "summary.json").read_text()), sheet_px=1.0)
+    assert (tmp_path / "run" / "report.html").stat().st_size > 100_000
+    assert not list(tmp_path.rglob("*.partial"))
+
+
+def test_the_paper_at_a_tenth_of_the_pixels(command, tmp_path):
+    assert command("+experiment=paper", "scale=10", "vibrating.seed=100") == 0
+    _check(json.loads((tmp_path / "run" / "summary.json").read_text()), sheet_px=1.0)
