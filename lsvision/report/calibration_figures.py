@@ -58,7 +58,7 @@ def stretch_by_iteration(curves: Mapping[str, Calibration], truth: float | None 
         axes.plot(range(len(values)), values, "o-", ms=4, color=color, label=name)
     if truth is not None:
         axes.axhline(truth, color=TRUTH, linestyle="--", linewidth=1, label=f"truth: {truth:.4f}")
-    label_axes(axes, "Stretch by iteration", "iteration", "stretch, true over nominal travel")
+    label_axes(axes, "Stretch by iteration", "iteration", "stretch, true over nominal travel [mm per mm]")
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     figure.legend(loc="outside right upper", fontsize=9)
     caption = "How much further the object moved per line than the encoder or the nominal pitch says."

@@ -19,7 +19,8 @@ def product_images(
     """
     rows, columns = height.shape
     q_y, q_x = origin_mm
-    extent = (q_x, q_x + columns * pitch_mm, q_y + rows * pitch_mm, q_y)
+    left, top = q_x - pitch_mm / 2, q_y - pitch_mm / 2  # the origin is the centre of the first cell
+    extent = (left, left + columns * pitch_mm, top + rows * pitch_mm, top)
     figure, axes = new_figure(11, 0.9 + 5.0 * min(max(rows / columns, 0.35), 1.4), 1, 2, sharex=True, sharey=True)
     show_image(axes[0], thinned(color), extent)
     label_axes(axes[0], "colour", "q_x across the motion [mm]", "q_y along the motion [mm]")
