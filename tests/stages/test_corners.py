@@ -106,7 +106,7 @@ def test_no_board_names_the_scan():
         find_corners(dataclasses.replace(scan, left=blank), BOARD)
     with pytest.raises(BoardNotFoundError, match="in the right image"):
         find_corners(dataclasses.replace(scan, right=blank), BOARD)
-    with pytest.raises(BoardNotFoundError, match="88 of 88 corners .* 89 are needed"):
+    with pytest.raises(BoardNotFoundError, match=r"88 of 88 corners .* 89 are needed"):
         find_corners(scan, BOARD, CornersConfig(min_corners=89))
 
 

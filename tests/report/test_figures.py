@@ -1,0 +1,99 @@
+"""Figures: each has a title, a caption and axes with units, and shows the values it was given."""
+
+import pytest
+import torch
+
+from lsvision.report.calibration_figures import (
+    components_by_iteration,
+    corner_positions,
+    corners_in_board_frame,
+    corners_on_images,
+    observability_bars,
+    rmse_by_iteration,
+    stretch_by_iteration,
+)
+from lsvision.report.drawing import new_figure, show_image, thinned
+from lsvision.report.product_figures import height_profile, product_images, sheet_correspondences
+
+# Counts and directions have no unit.
+UNITLESS = ("iteration", "direction of n")
+
+
+@pytest.fixture
+def figures(determined, dominated, corners):
+    curves = {"joint": determined, "two-step": dominated}
+    truth = {"joint": (-0.026, 1.02, 0.014)}
+    image, points = torch.randint(0, 256, (60, 80, 3)).to(torch.uint8), 50 * torch.rand(20, 2)
+    height = torch.rand(60, 80)
+    height[:10] = torch.nan
+    moved = points + 0.1 * torch.randn(20, 2)
+    return [
+        rmse_by_iteration(curves, {"paper": 0.8794}),
+        components_by_iteration(curves, truth),
+        stretch_by_iteration(curves, 1.0204),
+        observability_bars(determined),
+        observability_bars(dominated, name="other", label="two-step"),
+        corner_positions(corners, determined, label="first"),
+        corners_on_images((image, points), (image, points), 0.07),
+        product_images("product", "Colour and height", image, height, 0.5, (10.0, -20.0)),
+        height_profile("profile", "Profile", height, 0.5, -20.0),
+        sheet_correspondences((points, moved), (points, points), (image, image), 0.5),
+    ]
+
+
+def test_every_figure_says_what_it_shows(figures):
+    assert len({figure.name for figure in figures}) == len(figures)
+    for item in figures:
+        assert item.title
+        assert len(item.caption) > 30
+        assert item.caption.endswith(".") or "tilt the board" in item.caption or "determined" in item.caption
+        for axes in item.figure.axes:
+            if axes.get_label() == "<colorbar>":
+                assert "[" in axes.get_ylabel()
+                continue
+            assert axes.get_title()
+            shares_y = bool(axes.get_shared_y_axes().get_siblings(axes)[1:])
+            for label in (axes.get_xlabel(), axes.get_ylabel()):
+                unit = "[" in label and "]" in label
+                assert unit or label.startswith(UNITLESS) or (label == "" and shares_y), (item.name, label)
+
+
+def test_curves_hold_the_iterations(determined):
+    (axes,) = rmse_by_iteration({"joint": determined}).figure.axes
+    assert axes.lines[0].get_ydata().tolist() == [2.0, 0.5]
+    panels = components_by_iteration({"joint": determined}).figure.axes
+    assert [panel.lines[0].get_ydata().tolist() for panel in panels] == [[0.0, -0.026], [1.0, 1.02], [0.0, 0.014]]
+
+
+def test_corners_in_the_board_frame_undo_motion_and_pose(corners):
+    # The board ran 1.02 mm for each nominal one: with that n it fits, with the nominal one it is too short.
+    n = torch.tensor([0.0, 1.02, 0.0], dtype=torch.float64)
+    torch.testing.assert_close(corners_in_board_frame(corners, n), corners.board_points, rtol=0, atol=1e-9)
+    nominal = corners_in_board_frame(corners, torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64))
+    extent = nominal.amax(0) - nominal.amin(0)
+    torch.testing.assert_close(extent[:2], torch.tensor([60 / 1.02, 60.0], dtype=torch.float64), rtol=0, atol=1e-9)
+
+
+def test_product_axes_are_in_its_frame():
+    height = torch.arange(12.0).reshape(3, 4)
+    color = torch.zeros(3, 4, 3, dtype=torch.uint8)
+    figure = product_images("p", "t", color, height, 0.5, (10.0, -20.0)).figure
+    assert figure.axes[0].images[0].get_extent() == pytest.approx([-20.25, -18.25, 11.25, 9.75])
+    empty = product_images("p", "t", color, torch.full((3, 4), torch.nan), 0.5, (0.0, 0.0))
+    assert empty.figure.axes[1].images
+
+
+def test_profile_is_the_median_of_the_rows():
+    height = torch.tensor([[1.0, 2.0], [3.0, torch.nan], [50.0, 4.0]])
+    (axes,) = height_profile("p", "t", height, 0.5, 7.0).figure.axes
+    assert axes.lines[0].get_xdata().tolist() == [7.0, 7.5]
+    assert axes.lines[0].get_ydata().tolist() == [3.0, 3.0]
+
+
+def test_previews_are_thin_and_eight_bit():
+    assert thinned(torch.zeros(5000, 700, 3), most=1000).shape == (1000, 140, 3)
+    assert thinned(torch.zeros(30, 20)).shape == (30, 20)
+    _, (axes,) = new_figure(2, 2)
+    image = torch.tensor([[[65535], [256]]]).to(torch.uint16)
+    shown = show_image(axes, image, (0, 2, 1, 0))
+    assert shown.get_array().tolist() == [[255, 1]]
