@@ -19,7 +19,7 @@ from lsvision.stages.board_model import (
     rotations,
     translations,
 )
-from lsvision.stages.motion_estimate import CalibrationConfig, estimate, rmse
+from lsvision.stages.motion_estimate import METHODS, CalibrationConfig, estimate, rmse
 from lsvision.stages.observability import observe
 from lsvision.types import BoardCorners, BoardFit, Calibration, Iteration, Motion, Rig
 
@@ -120,10 +120,11 @@ def _solve(
     points: Tensor, covariance: Tensor, board_points: Tensor, valid: Tensor, config: CalibrationConfig
 ) -> tuple[BoardProblem, Posterior, Tensor, BatchCalibration]:
     """Problem, posterior, noise scale and summary of a batch."""
-    pitch = _mounting_pitch(config, points.shape[-3])
-    problem, start, sound = _sound_problem(points, covariance, board_points, valid, pitch)
+    _check(config, points.shape[-3])
+    problem, start, sound = _sound_problem(points, covariance, board_points, valid, _mounting_pitch(config))
     posterior = estimate(problem, start, config)
-    scale = _noise_scale(problem, posterior)
+    drifting = config.method == "sequential" and config.process_sigma > 0  # what one n leaves over is then no noise
+    scale = torch.ones_like(start[..., 0]) if drifting else _noise_scale(problem, posterior)
     if bool((scale > 1).any()):
         noisier = replace(problem, noise_chol=problem.noise_chol * scale.sqrt()[..., None, None, None, None])
         posterior = _merge(scale > 1, estimate(noisier, start, config), posterior)
@@ -167,17 +168,30 @@ def _collinear(points: Tensor, seen: Tensor) -> Tensor:
     return scatter[..., 1] <= _COLLINEAR**2 * scatter[..., 2]
 
 
-def _mounting_pitch(config: CalibrationConfig, boards: int) -> MountingPitch | None:
-    """The prior on a single board's pitch, and a check of the options that only one thing can make sense of."""
+def _check(config: CalibrationConfig, boards: int) -> None:
+    """Raise ConfigError for the first option that is out of range."""
+    if config.method not in METHODS:
+        raise ConfigError(f"calibration.method must be one of {', '.join(METHODS)}, is {config.method}")
     for name in ("prior_sigma", "rotation_sigma_rad", "translation_sigma_mm", "mounting_pitch_sigma_deg"):
         if not getattr(config, name) > 0:
             raise ConfigError(f"calibration.{name} must be positive, is {getattr(config, name)}")
+    for name in ("max_iterations", "two_step_max_iterations"):
+        if getattr(config, name) < 1:
+            raise ConfigError(f"calibration.{name} must be at least 1, is {getattr(config, name)}")
+    for name in ("tolerance", "two_step_threshold_mm", "process_sigma"):
+        if not getattr(config, name) >= 0:
+            raise ConfigError(f"calibration.{name} must not be negative, is {getattr(config, name)}")
     if not math.isfinite(config.prior_sigma):
         raise ConfigError("calibration.prior_sigma must be finite: not every board scan determines n without a prior")
+    if config.mounting_pitch_deg is not None and boards != 1:
+        raise ConfigError(f"calibration.mounting_pitch_deg is for a single board scan, not for {boards}")
+    if config.mounting_pitch_deg is not None and config.method in ("two_step", "sequential"):
+        raise ConfigError(f"calibration.mounting_pitch_deg has no place in the method {config.method}")
+
+
+def _mounting_pitch(config: CalibrationConfig) -> MountingPitch | None:
     if config.mounting_pitch_deg is None:
         return None
-    if boards != 1:
-        raise ConfigError(f"calibration.mounting_pitch_deg is for a single board scan, not for {boards}")
     return MountingPitch(math.radians(config.mounting_pitch_deg), math.radians(config.mounting_pitch_sigma_deg))
 
 

@@ -62,8 +62,7 @@ class CalibrationConfig:
 
 def estimate(problem: BoardProblem, start: Float[Tensor, "*batch state"], config: CalibrationConfig) -> Posterior:
     """Posterior of the poses and n by the configured method."""
-    methods = {"joint": joint, "two_step": two_step, "sequential": sequential, "least_squares": least_squares}
-    return methods[config.method](problem, start, config)
+    return METHODS[config.method](problem, start, config)
 
 
 def joint(problem: BoardProblem, start: Float[Tensor, "*batch state"], config: CalibrationConfig) -> Posterior:
@@ -168,6 +167,9 @@ def rmse(problem: BoardProblem, state: Float[Tensor, "*#batch state"]) -> Float[
     """Root-mean-square residual over all corners of all boards, mm."""
     squared = residuals(problem, state).square().sum((-3, -2, -1))
     return (squared / problem.valid.sum((-2, -1))).sqrt()
+
+
+METHODS = {"joint": joint, "two_step": two_step, "sequential": sequential, "least_squares": least_squares}
 
 
 def _update_part(problem: BoardProblem, state: Tensor, start: Tensor, part: slice, config: CalibrationConfig) -> Tensor:

@@ -1,5 +1,6 @@
 """Statistical linear regression: exact where linear, the derivative where narrow, its error's covariance."""
 
+import itertools
 import math
 
 import pytest
@@ -50,5 +51,5 @@ def test_regression_tends_to_the_derivative_with_the_square_of_sigma():
     for sigma in (1e-1, 1e-2, 1e-3, 1e-4):
         spread = torch.diag(torch.tensor([sigma] * 3 + [1e-3] * 6, dtype=torch.float64))
         errors.append((slr(corner, STATE, spread)[0][:, :3] - derivative).abs().max().item())
-    for wide, narrow in zip(errors, errors[1:], strict=False):
+    for wide, narrow in itertools.pairwise(errors):
         assert wide / narrow == pytest.approx(100.0, rel=0.2)
