@@ -9,8 +9,9 @@ import logging
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
-from lsvision.experiments.correct import ProductSummary, write_product
+from lsvision.experiments.correct import write_product
 from lsvision.experiments.paper_pages import PAPER, BoardCheck, Scenario, write_paper_report
+from lsvision.experiments.parallel import scan_pool
 from lsvision.experiments.progress import ProgressBars, progress_bars
 from lsvision.experiments.settings import RunSettings
 from lsvision.experiments.sheet import points_in_product, points_in_scan
@@ -23,7 +24,7 @@ from lsvision.stages.corners import CornersConfig, find_corners
 from lsvision.stages.correction import CorrectionConfig, ProductGrid
 from lsvision.stages.disparity import DisparityConfig, depth_of
 from lsvision.stages.measurement import distance_errors, measure_board
-from lsvision.types import Board, BoardCorners, Rig, TensorImage
+from lsvision.types import Board, BoardCorners, Rig, Scan, TensorImage
 
 log = logging.getLogger(__name__)
 
@@ -83,37 +84,45 @@ def run_paper(settings: PaperSettings, folder: Path) -> None:
 def _scenario(settings: PaperSettings, motion: MotionConfig, folder: Path, bars: ProgressBars) -> Scenario:
     """Render, read back, calibrate by both methods, correct and measure, for one motion."""
     simulations = _simulations(settings, motion)
-    for name, simulation in simulations.items():
-        write_simulation(simulation, folder / name, bars)
-    scans = {name: read_scan(folder / name) for name in simulations}
-    boards = {
-        name: find_corners(scan, settings.board, settings.corners)
-        for name, scan in scans.items()
-        if name.startswith("board")
-    }
-    rig = scans["sheet"].rig
-    joint = calibrate(list(boards.values()), rig, settings.joint)
-    two_step = calibrate([next(iter(boards.values()))], rig, settings.two_step)
-    for method, calibration in (("joint", joint), ("two_step", two_step)):
-        write_calibration(calibration, folder / f"calibration_{method}.json")
+    names = list(simulations)
+    with scan_pool(settings.threads) as pool:
+        rendered = pool.map(lambda name: _rendered(simulations[name], folder / name, bars), names)
+        scans = dict(zip(names, rendered, strict=True))
+        boards = {name: scan for name, scan in scans.items() if name.startswith("board")}
+        found = pool.map(lambda scan: find_corners(scan, settings.board, settings.corners), boards.values())
+        corners = dict(zip(boards, found, strict=True))
 
-    products = {}
-    for name, scan in scans.items():
-        target = folder / f"{name}.zarr"
-        summary = write_product(scan, joint.motion, settings.disparity, settings.correction, target, bars)
-        products[name] = (read_product(target), summary)
+        rig = scans["sheet"].rig
+        joint = calibrate(list(corners.values()), rig, settings.joint)
+        two_step = calibrate([next(iter(corners.values()))], rig, settings.two_step)
+        for method, calibration in (("joint", joint), ("two_step", two_step)):
+            write_calibration(calibration, folder / f"calibration_{method}.json")
+
+        def corrected(name: str) -> Product:
+            target = folder / f"{name}.zarr"
+            write_product(scans[name], joint.motion, settings.disparity, settings.correction, target, bars)
+            return read_product(target)
+
+        products = dict(zip(names, pool.map(corrected, names), strict=True))
+        checked = pool.map(lambda name: _check_board(settings.board, corners[name], products[name]), boards)
+        checks = dict(zip(boards, checked, strict=True))
     sheet = simulations["sheet"]
-    color, height, grid = _in_memory(*products["sheet"])
+    color, height, grid = _in_memory(products["sheet"])
     return Scenario(
-        n_true=simulations["sheet"].trajectory.n,
+        n_true=sheet.trajectory.n,
         results={"joint": joint, "two_step": two_step},
-        boards=boards,
-        checks={name: _check_board(settings.board, boards[name], *products[name]) for name in boards},
+        boards=corners,
+        checks=checks,
         sheet_before=points_in_scan(scans["sheet"], depth_of(scans["sheet"], settings.disparity), sheet),
         sheet_after=points_in_product(color, height, grid, joint.motion.n, sheet),
         scans=scans,
-        products={name: product for name, (product, _) in products.items()},
+        products=products,
     )
+
+
+def _rendered(simulation: Simulation, folder: Path, bars: ProgressBars) -> Scan:
+    write_simulation(simulation, folder, bars)
+    return read_scan(folder)
 
 
 def _simulations(settings: PaperSettings, motion: MotionConfig) -> dict[str, Simulation]:
@@ -137,11 +146,11 @@ def _simulations(settings: PaperSettings, motion: MotionConfig) -> dict[str, Sim
     }
 
 
-def _check_board(board: Board, corners: BoardCorners, product: Product, summary: ProductSummary) -> BoardCheck:
+def _check_board(board: Board, corners: BoardCorners, product: Product) -> BoardCheck:
     """Distances between a board's corners at nominal motion and in the product."""
     nominal = displace(corners.points, corners.points.new_tensor([0.0, 1.0, 0.0]))
     before = distance_errors(nominal, board, corners.valid)
-    measured = measure_board(*_in_memory(product, summary), board)
+    measured = measure_board(*_in_memory(product), board)
     if measured is None:
         return BoardCheck(0, before, (float("nan"), float("nan")), None)
     return BoardCheck(
@@ -152,7 +161,7 @@ def _check_board(board: Board, corners: BoardCorners, product: Product, summary:
     )
 
 
-def _in_memory(product: Product, summary: ProductSummary) -> tuple[TensorImage, TensorImage, ProductGrid]:
+def _in_memory(product: Product) -> tuple[TensorImage, TensorImage, ProductGrid]:
     rows, columns = product.shape
     color, height = product.color(0, rows), product.height(0, rows)
     origin_y, origin_x = product.origin_mm
