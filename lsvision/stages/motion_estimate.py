@@ -118,7 +118,7 @@ def sequential(problem: BoardProblem, start: Float[Tensor, "*batch state"], conf
     for _ in range(config.max_iterations):
         rows = rows_order(corner_rows(problem, mean, factor))
         track = filter_sequence(
-            lambda points, step, A=rows[..., :-1]: apply(A[step], points.contiguous()),
+            partial(_corner_values, rows[..., :-1]),
             start - mean,
             _wide_chol(start, config),
             rows[..., -1],
@@ -213,6 +213,11 @@ def _line_order(problem: BoardProblem, sigma: float) -> tuple[Callable[[Tensor],
     spread = sigma * torch.where(valid, between, 0.0).sqrt()
     moving = torch.cat([spread.new_zeros(6 * problem.boards), spread.new_ones(3)])
     return reorder, valid, torch.diag_embed(spread[..., None] * moving)
+
+
+def _corner_values(A: Tensor, points: Tensor, step: int) -> Tensor:
+    """Linearised corner of a step; the points are copied so that sums run alike for one problem and for many."""
+    return apply(A[step], points.contiguous())
 
 
 def _wide_chol(start: Tensor, config: CalibrationConfig) -> Tensor:
