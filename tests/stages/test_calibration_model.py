@@ -129,6 +129,21 @@ def test_known_pitch_adds_one_row():
     assert torch.linalg.eigvalsh(motion_information(problem, start))[0] * 0.05**2 > 100
 
 
+def test_pitch_row_tends_to_the_derivative_with_the_square_of_sigma():
+    corners = simulate([(7.0, 3.0, 0.0)])
+    known = MountingPitch(math.radians(7.0), 1.0)
+    chol = torch.linalg.cholesky(corners.covariance)
+    problem, start = nominal_problem(corners.points, chol, corners.board_points, corners.valid, known)
+    state = start + 0.05 * torch.randn_like(start)
+    derivative = -jacobian(lambda x: whitened_residuals(problem, x), state)[-1]
+    errors = []
+    for sigma in (1e-1, 1e-2, 1e-3, 1e-4):
+        row = linearise(problem, state, spread(sigma, 9)).matrix[-1]
+        errors.append((row[:-1] - derivative).abs().max().item())
+    for wide, narrow in itertools.pairwise(errors):
+        assert wide / narrow == pytest.approx(100.0, rel=0.2)
+
+
 def test_residual_is_displaced_measurement_less_board():
     corners = simulate(batch=(2,))
     problem, start = corners.problem()
