@@ -16,6 +16,8 @@ from lsvision.types import Board, LineImage
 _LUMA = (0.299, 0.587, 0.114)
 _REDUCED_WIDTH = 900  # columns in which the coarse search runs: squares of a full-field board still have 40 px
 _READ_LINES = 512
+# How far the fit of a window may be from the board's median: a corner under glare, smear or dirt is another picture.
+_WORST_RESIDUAL, _WORST_BLUR, _LEAST_CONTRAST = 3.0, 2.0, 0.3
 
 
 @dataclass(frozen=True)
@@ -114,8 +116,7 @@ def refine_grid(image: LineImage, grid: Float[Tensor, "rows columns 2"]) -> Dete
     points = grid.reshape(-1, 2)
     along_x, along_y = _neighbour_vectors(grid)
     spacing = torch.minimum(along_x.norm(dim=-1), along_y.norm(dim=-1)).min()
-    # Edges along the pixels need a long run; past it the board's own texture, which the covariance takes for white
-    # noise, weighs more than what is gained.
+    # Edges along the pixels need a long run; past it the board's own texture weighs more than what is gained.
     radius = int((0.35 * spacing).clamp(3, 13))
     centre = points.round().long()
     windows, inside = _windows(image, centre, radius)
@@ -126,10 +127,20 @@ def refine_grid(image: LineImage, grid: Float[Tensor, "rows columns 2"]) -> Dete
 
 
 def _detected(fit: SaddleFit, centre: Tensor, inside: Tensor) -> DetectedCorners:
+    """Corners whose windows look like those of the rest of the board: smear, glare and what lies over it do not."""
     valid = fit.valid & inside
+    valid = valid & (fit.residual / fit.contrast < _WORST_RESIDUAL * _median(fit.residual / fit.contrast, valid))
+    valid = valid & (fit.blur_px < _WORST_BLUR * _median(fit.blur_px, valid))
+    valid = valid & (fit.contrast > _LEAST_CONTRAST * _median(fit.contrast, valid))
+    # The surface's texture is the same all over the board, and one window tells too little about it.
+    gain = fit.correlation_gain[valid].mean()
     position = torch.where(valid[:, None], centre + fit.position, torch.nan)
-    covariance = torch.where(valid[:, None, None], fit.covariance, torch.nan)
+    covariance = torch.where(valid[:, None, None], gain * fit.covariance, torch.nan)
     return DetectedCorners(position, covariance, valid)
+
+
+def _median(values: Tensor, valid: Tensor) -> Tensor:
+    return torch.where(valid, values, torch.nan).nanmedian()
 
 
 def _windows(image: LineImage, centre: Tensor, radius: int) -> tuple[Tensor, Tensor]:

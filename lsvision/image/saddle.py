@@ -7,18 +7,29 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-# Columns of the parameter vector.
-_POSITION, _ANGLE_1, _ANGLE_2, _BLUR, _CONTRAST, _OFFSET = slice(0, 2), 2, 3, 4, 5, 6
-_PARAMETERS = 9  # the last two are the brightness gradient along u and v
+from lsvision.image.correlated_noise import correlation_gain
+
+# Columns of the parameter vector: five that enter non-linearly, then (1, u, v) of each of the four levels.
+_POSITION, _ANGLE_1, _ANGLE_2, _BLUR, _LEVELS = slice(0, 2), 2, 3, 4, 5
+_PARAMETERS = 17
+_OFFSET, _CONTRAST = 5, 14
+# The plain saddle b + g (u, v) + c E1 E2 comes first: it has few minima, the full model then starts inside its own.
+_PLAIN = [0, 1, _ANGLE_1, _ANGLE_2, _BLUR, 5, 6, 7, _CONTRAST]
+_FULL = list(range(_PARAMETERS))
+_SMALLEST_STEP_PX = 1e-6  # shorter steps change nothing that is measured
 
 
 @dataclass(frozen=True)
 class SaddleFit:
-    """Fitted corners: ``position (corners, 2)`` as (u, v) px from the window's centre, its covariance in px², and
-    whether the window looks like a corner."""
+    """Fitted corners: ``position (corners, 2)`` as (u, v) px from the window's centre, and whether each is a corner.
+
+    ``covariance``, px², is that of independent noise in the pixels; where the residuals are correlated, as a surface's
+    own texture is, the scatter is ``correlation_gain`` times as large. One window's gain is a rough figure: average it.
+    """
 
     position: Float[Tensor, "corners 2"]
     covariance: Float[Tensor, "corners 2 2"]
+    correlation_gain: Float[Tensor, " corners"]
     blur_px: Float[Tensor, " corners"]
     contrast: Float[Tensor, " corners"]
     residual: Float[Tensor, " corners"]
@@ -33,87 +44,109 @@ def fit_saddles(
     max_shift_px: float = 3.0,
     max_residual: float = 0.35,
 ) -> SaddleFit:
-    """Fit ``b + g·(u, v) + c erf(d1 / √2 s) erf(d2 / √2 s)`` to windows centred near checkerboard corners.
+    """Fit ``A0 + A1 E1 + A2 E2 + A3 E1 E2``, ``Ek = erf(dk / √2 s)``, to windows centred near checkerboard corners.
 
-    d1 and d2 are the distances to the two edges that cross in the corner, s the blur. Levenberg-Marquardt on nine
-    parameters per window; the covariance is the residual variance times the inverse normal matrix.
+    d1 and d2 are the distances to the two edges that cross in the corner, s the blur. Each ``Ak = a + b u + c v``, so
+    that every quadrant has a level and a gradient of its own: light falls off, print and paper are not even.
+    Levenberg-Marquardt on 17 parameters a window; the covariance is the residual variance times the inverse normal
+    matrix.
 
     Args:
         windows: grey values, odd size; the corner within about two pixels of the centre. One with a NaN is not valid.
         angles: direction of the normal of each edge, rad from u towards v; good to about 0.3 rad.
-        iterations: number of steps, the same for all windows.
+        iterations: largest number of steps of either model.
         max_shift_px: a corner further than this from the centre is not valid.
         max_residual: neither is one whose residual rms exceeds this share of its contrast.
     """
     count, size, _ = windows.shape
     half = (size - 1) / 2
     axis = torch.arange(size, dtype=windows.dtype, device=windows.device) - half
-    grid = torch.stack(torch.meshgrid(axis, axis, indexing="xy"), dim=-1).reshape(1, -1, 2)
+    grid = torch.stack(torch.meshgrid(axis, axis, indexing="xy")).flatten(1)
     values = windows.reshape(count, -1)
     complete = torch.isfinite(values).all(-1)
     values = torch.where(complete[:, None], values, 0.0)
     parameters = _initial_parameters(values, grid, angles)
-    damping = torch.full((count,), 1e-2, dtype=values.dtype, device=values.device)
+    for free in (_PLAIN, _FULL):
+        parameters = _descend(parameters, values, grid, free, iterations)
     model, jacobian = _saddle(parameters, grid)
-    cost = (values - model).square().sum(-1)
-    for _ in range(iterations):
-        step = _damped_step(jacobian, values - model, damping)
-        trial = _bounded(parameters + step)
-        trial_model, trial_jacobian = _saddle(trial, grid)
-        trial_cost = (values - trial_model).square().sum(-1)
-        better = trial_cost < cost
-        parameters = torch.where(better[:, None], trial, parameters)
-        model = torch.where(better[:, None], trial_model, model)
-        jacobian = torch.where(better[:, None, None], trial_jacobian, jacobian)
-        cost = torch.where(better, trial_cost, cost)
-        damping = torch.where(better, damping / 5, damping * 5).clamp(1e-9, 1e6)
-    variance = cost / (size * size - _PARAMETERS)
-    inverse = torch.linalg.pinv(jacobian.mT @ jacobian, hermitian=True)
-    position, contrast, residual = parameters[:, _POSITION], parameters[:, _CONTRAST].abs(), variance.sqrt()
+    residual = values - model
+    variance = residual.square().sum(-1) / (size * size - _PARAMETERS)
+    inverse = _inverse_normal(jacobian)
+    position, contrast = parameters[:, _POSITION], parameters[:, _CONTRAST].abs()
     crossing = torch.sin(parameters[:, _ANGLE_1] - parameters[:, _ANGLE_2]).abs()
     valid = (
         complete
         & (torch.linalg.vector_norm(position, dim=-1) < max_shift_px)
-        & (residual < max_residual * contrast)
+        & (variance.sqrt() < max_residual * contrast)
         & (crossing > 0.2)  # edges nearly parallel: not a corner
         & (parameters[:, _BLUR] < half / 2)
     )
-    covariance = inverse[:, _POSITION, _POSITION] * variance[:, None, None]
-    return SaddleFit(position, covariance, parameters[:, _BLUR], contrast, residual, valid)
+    return SaddleFit(
+        position,
+        inverse[:, _POSITION, _POSITION] * variance[:, None, None],
+        correlation_gain(jacobian, inverse, _POSITION, residual, size),
+        parameters[:, _BLUR],
+        contrast,
+        variance.sqrt(),
+        valid,
+    )
+
+
+def _descend(parameters: Tensor, values: Tensor, grid: Tensor, free: list[int], iterations: int) -> Tensor:
+    """Levenberg-Marquardt on the ``free`` parameters, each window on its own until its corner stands still."""
+    damping = torch.full_like(values[:, 0], 1e-3)
+    moving = torch.ones_like(damping, dtype=torch.bool)
+    model, jacobian = _saddle(parameters, grid)
+    cost = (values - model).square().sum(-1)
+    for _ in range(iterations):
+        step = torch.zeros_like(parameters)
+        step[:, free] = _damped_step(jacobian[:, free], values - model, damping)
+        trial = _bounded(parameters + step)
+        trial_model, trial_jacobian = _saddle(trial, grid)
+        trial_cost = (values - trial_model).square().sum(-1)
+        better = moving & (trial_cost < cost)
+        parameters = torch.where(better[:, None], trial, parameters)
+        model = torch.where(better[:, None], trial_model, model)
+        jacobian = torch.where(better[:, None, None], trial_jacobian, jacobian)
+        cost = torch.where(better, trial_cost, cost)
+        damping = torch.where(better, damping / 10, damping * 5).clamp(1e-9, 1e6)
+        moving = moving & (torch.linalg.vector_norm(step[:, _POSITION], dim=-1) > _SMALLEST_STEP_PX)
+        if not bool(moving.any()):
+            break
+    return parameters
 
 
 def _saddle(parameters: Tensor, grid: Tensor) -> tuple[Tensor, Tensor]:
-    """Model values (corners, pixels) and their Jacobian (corners, pixels, 9)."""
-    blur, contrast = parameters[:, _BLUR, None], parameters[:, _CONTRAST, None]
-    offset = grid - parameters[:, None, _POSITION]
-    edge_1, by_distance_1, normal_1, tangent_1 = _edge(offset, parameters[:, _ANGLE_1, None], blur)
-    edge_2, by_distance_2, normal_2, tangent_2 = _edge(offset, parameters[:, _ANGLE_2, None], blur)
-    slope_1, slope_2 = contrast * by_distance_1 * edge_2, contrast * by_distance_2 * edge_1
-    along_1, along_2 = (offset * normal_1).sum(-1), (offset * normal_2).sum(-1)
-    model = contrast * edge_1 * edge_2 + parameters[:, _OFFSET, None]
-    model = model + (parameters[:, None, _OFFSET + 1 :] * grid).sum(-1)
-    by_position = -(slope_1[..., None] * normal_1 + slope_2[..., None] * normal_2)
-    columns = [
-        by_position[..., 0],
-        by_position[..., 1],
-        slope_1 * (offset * tangent_1).sum(-1),
-        slope_2 * (offset * tangent_2).sum(-1),
-        -(slope_1 * along_1 + slope_2 * along_2) / blur,
-        edge_1 * edge_2,
-        torch.ones_like(model),
-        grid[..., 0].expand_as(model),
-        grid[..., 1].expand_as(model),
+    """Model values (corners, pixels) and their Jacobian (corners, 17, pixels)."""
+    position, blur = parameters[:, _POSITION], parameters[:, _BLUR, None]
+    u, v = grid[0] - position[:, :1], grid[1] - position[:, 1:]
+    edges = [_edge(u, v, parameters[:, angle, None], blur) for angle in (_ANGLE_1, _ANGLE_2)]
+    (edge_1, rise_1, normal_1, along_1, across_1), (edge_2, rise_2, normal_2, along_2, across_2) = edges
+    plane = torch.cat([torch.ones_like(grid[:1]), grid])
+    levels = parameters[:, _LEVELS:].unflatten(-1, (4, 3)) @ plane
+    shapes = torch.stack([torch.ones_like(edge_1), edge_1, edge_2, edge_1 * edge_2], dim=1)
+    slope_1 = (levels[:, 1] + levels[:, 3] * edge_2) * rise_1
+    slope_2 = (levels[:, 2] + levels[:, 3] * edge_1) * rise_2
+    by_shape = [
+        -(slope_1 * normal_1[0] + slope_2 * normal_2[0]),
+        -(slope_1 * normal_1[1] + slope_2 * normal_2[1]),
+        slope_1 * along_1,
+        slope_2 * along_2,
+        -(slope_1 * across_1 + slope_2 * across_2) / blur,
     ]
-    return model, torch.stack(columns, dim=-1)
+    by_levels = (shapes[:, :, None] * plane).flatten(1, 2)
+    return (levels * shapes).sum(1), torch.cat([torch.stack(by_shape, dim=1), by_levels], dim=1)
 
 
-def _edge(offset: Tensor, angle: Tensor, blur: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Blurred unit edge through the corner, its derivative by distance, and the edge's normal and tangent."""
-    normal = torch.stack([torch.cos(angle), torch.sin(angle)], dim=-1)
-    tangent = torch.stack([-torch.sin(angle), torch.cos(angle)], dim=-1)
-    scaled = (offset * normal).sum(-1) / (math.sqrt(2.0) * blur)
-    derivative = math.sqrt(2.0 / math.pi) / blur * torch.exp(-scaled.square())
-    return torch.erf(scaled), derivative, normal, tangent
+def _edge(
+    u: Tensor, v: Tensor, angle: Tensor, blur: Tensor
+) -> tuple[Tensor, Tensor, tuple[Tensor, Tensor], Tensor, Tensor]:
+    """Blurred unit edge through the corner, its derivative by distance, its normal, and distances along and from it."""
+    cosine, sine = torch.cos(angle), torch.sin(angle)
+    across, along = u * cosine + v * sine, v * cosine - u * sine
+    scaled = across / (math.sqrt(2.0) * blur)
+    rise = math.sqrt(2.0 / math.pi) / blur * torch.exp(-scaled.square())
+    return torch.erf(scaled), rise, (cosine, sine), along, across
 
 
 def _initial_parameters(values: Tensor, grid: Tensor, angles: Tensor) -> Tensor:
@@ -132,11 +165,20 @@ def _initial_parameters(values: Tensor, grid: Tensor, angles: Tensor) -> Tensor:
 
 def _damped_step(jacobian: Tensor, residual: Tensor, damping: Tensor) -> Tensor:
     """Levenberg-Marquardt step, in parameters scaled so that the unit of the grey values does not matter."""
-    length = torch.linalg.vector_norm(jacobian, dim=-2)
+    scaled, length = _unit_columns(jacobian)
+    normal = scaled @ scaled.mT + torch.diag_embed(damping[:, None].expand_as(length))
+    return torch.linalg.solve(normal, scaled @ residual[..., None])[..., 0] / length
+
+
+def _inverse_normal(jacobian: Tensor) -> Tensor:
+    scaled, length = _unit_columns(jacobian)
+    return torch.linalg.pinv(scaled @ scaled.mT, hermitian=True) / (length[:, None] * length[..., None])
+
+
+def _unit_columns(jacobian: Tensor) -> tuple[Tensor, Tensor]:
+    length = torch.linalg.vector_norm(jacobian, dim=-1)
     length = torch.where(length > 0, length, 1.0)  # without contrast nothing moves the corner
-    scaled = jacobian / length[:, None]
-    normal = scaled.mT @ scaled + torch.diag_embed(damping[:, None].expand_as(length))
-    return torch.linalg.solve(normal, scaled.mT @ residual[..., None])[..., 0] / length
+    return jacobian / length[..., None], length
 
 
 def _bounded(parameters: Tensor) -> Tensor:

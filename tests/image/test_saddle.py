@@ -22,22 +22,25 @@ def test_batch_equals_loop(corners):
 
 def test_model_by_hand():
     # Edges along the axes, blur 1, contrast 10 on 50 with slope 2 along u: at one blur right of and below the corner
-    # both edges are erf(1 / sqrt 2), the share of a normal distribution within one sigma.
-    parameters = torch.tensor([[0.5, -0.25, 0.0, math.pi / 2, 1.0, 10.0, 50.0, 2.0, 0.0]], dtype=torch.float64)
-    value, _ = _saddle(parameters, torch.tensor([[[1.5, 0.75], [0.5, -0.25]]], dtype=torch.float64))
-    torch.testing.assert_close(value[0], torch.tensor([50 + 3.0 + 10 * 0.6826894921370859**2, 51.0]).double())
+    # both edges are erf(1 / sqrt 2), the share of a normal distribution within one sigma. Right of the first edge lies
+    # another 4, more of it further down.
+    parameters = torch.tensor([[0.5, -0.25, 0.0, math.pi / 2, 1.0, 50, 2, 0, 4, 0, 1, 0, 0, 0, 10, 0, 0]]).double()
+    value, _ = _saddle(parameters, torch.tensor([[1.5, 0.5], [0.75, -0.25]], dtype=torch.float64))
+    share = 0.6826894921370859
+    expected = torch.tensor([53.0 + (4 + 0.75) * share + 10 * share**2, 51.0]).double()
+    torch.testing.assert_close(value[0], expected)
 
 
 def test_jacobian_is_the_derivative(corners):
     position, angles, blur = (tensor[:3] for tensor in corners)
-    linear = torch.tensor([[60.0, 100.0, 0.7, -0.3]], dtype=torch.float64).expand(3, 4)
-    parameters = torch.cat([position, angles, blur[:, None], linear], dim=-1)
+    levels = 60 * torch.randn(3, 12, dtype=torch.float64)
+    parameters = torch.cat([position, angles, blur[:, None], levels], dim=-1)
     axis = torch.arange(-3, 4, dtype=torch.float64)
-    grid = torch.stack(torch.meshgrid(axis, axis, indexing="xy"), dim=-1).reshape(1, -1, 2)
+    grid = torch.stack(torch.meshgrid(axis, axis, indexing="xy")).flatten(1)
     by_autograd = torch.autograd.functional.jacobian(lambda p: _saddle(p, grid)[0], parameters)
     ours = _saddle(parameters, grid)[1]
     for i in range(3):
-        torch.testing.assert_close(ours[i], by_autograd[i, :, i], rtol=0, atol=1e-10)
+        torch.testing.assert_close(ours[i].mT, by_autograd[i, :, i], rtol=0, atol=1e-9)
 
 
 def test_position_is_recovered_without_noise(corners):
@@ -73,6 +76,41 @@ def test_covariance_predicts_the_scatter():
     correlation = torch.corrcoef(error.T)[0, 1]
     assert abs(correlation - predicted[0, 1] / predicted.diagonal().prod().sqrt()) < 0.15
     torch.testing.assert_close(fit.residual.square().mean().sqrt(), torch.tensor(noise).double(), rtol=0.02, atol=0)
+
+
+@pytest.mark.parametrize("texture", [0.0, 6.0])
+def test_covariance_allows_for_texture(texture):
+    count, noise = 300, 3.0
+    position = torch.zeros(count, 2).double()
+    angles = torch.tensor([0.3, 0.3 + 1.6]).double().expand(count, 2)
+    windows = saddle_windows(position, angles, torch.ones(count).double())
+    coarse = torch.randn(count, 1, SIZE + 2, SIZE + 2, dtype=torch.float64)
+    smooth = torch.nn.functional.avg_pool2d(coarse, 3, 1)[:, 0] * 3
+    fit = fit_saddles(windows + noise * torch.randn_like(windows) + texture * smooth, angles)
+    scatter = fit.position.square().mean(0).sqrt()
+    white = fit.covariance.diagonal(dim1=-2, dim2=-1).mean(0).sqrt()
+    gain = fit.correlation_gain.mean().sqrt()
+    torch.testing.assert_close(gain * white, scatter, rtol=0.2, atol=0)
+    if texture == 0:
+        assert abs(gain - 1) < 0.03
+    else:
+        assert gain > 1.4
+
+
+def test_uneven_quadrants_pull_no_corner():
+    # Reflectance rises across one square only and falls off across the window: every quadrant has a level of its own.
+    position = 2 * torch.rand(20, 2, dtype=torch.float64) - 1
+    angles = torch.tensor([0.2, 1.9]).double().expand(20, 2)
+    windows = saddle_windows(position, angles, torch.ones(20).double())
+    axis = torch.arange(SIZE, dtype=torch.float64) - SIZE // 2
+    v, u = torch.meshgrid(axis, axis, indexing="ij")
+    distance = [
+        (u - position[:, 0, None, None]) * math.cos(a) + (v - position[:, 1, None, None]) * math.sin(a)
+        for a in (0.2, 1.9)
+    ]
+    one_square = torch.special.ndtr(distance[0]) * torch.special.ndtr(distance[1])
+    fit = fit_saddles(windows + one_square * (20 + 0.8 * u + 0.5 * v) - 0.6 * v, angles)
+    assert (fit.position - position).abs().max() < 1e-4
 
 
 @pytest.mark.parametrize("kind", ["flat", "edge", "noise", "far", "missing"])
