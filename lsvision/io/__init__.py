@@ -6,15 +6,27 @@ from lsvision.io.checksum import scan_sha256
 from lsvision.io.encoder import read_encoder, write_encoder
 from lsvision.io.line_image import open_line_image
 from lsvision.io.ply import write_ply
-from lsvision.io.product import Product, ProductWriter, read_product
+from lsvision.io.product import (
+    Product,
+    ProductLayout,
+    ProductRows,
+    ProductWriter,
+    complete_product,
+    create_product,
+    read_product,
+)
 from lsvision.io.rig import read_rig, rig_from_dict, rig_to_dict, write_rig
 from lsvision.io.scan import read_scan, write_scan
 from lsvision.io.tiff import write_line_image
 
 __all__ = [
     "Product",
+    "ProductLayout",
+    "ProductRows",
     "ProductWriter",
     "check_rig_match",
+    "complete_product",
+    "create_product",
     "open_line_image",
     "read_calibration",
     "read_encoder",

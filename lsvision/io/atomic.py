@@ -35,8 +35,7 @@ def partial_folder(target: Path | str, *, marker: str) -> Iterator[Path]:
         FileFormatError: ``target`` exists, is not empty and does not hold ``marker``.
     """
     target = Path(target).resolve()
-    if target.exists() and not _replaceable(target, marker):
-        raise FileFormatError(target, f"expected a new or empty folder, or one with {marker} to replace")
+    _check_replaceable(target, marker)
     target.parent.mkdir(parents=True, exist_ok=True)
     partial = _hidden_sibling(target)
     partial.mkdir()
@@ -45,6 +44,18 @@ def partial_folder(target: Path | str, *, marker: str) -> Iterator[Path]:
         _take_over(partial, target)
     finally:
         shutil.rmtree(partial, ignore_errors=True)
+
+
+def replace_folder(source: Path | str, target: Path | str, *, marker: str) -> None:
+    """Give a finished folder its final name on the same file system; what ``target`` may hold: see ``partial_folder``.
+
+    Raises:
+        FileFormatError: ``target`` exists, is not empty and does not hold ``marker``.
+    """
+    target = Path(target).resolve()
+    _check_replaceable(target, marker)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    _take_over(Path(source), target)
 
 
 def write_text(path: Path | str, text: str) -> None:
@@ -58,8 +69,9 @@ def _hidden_sibling(target: Path) -> Path:
     return target.with_name(f".{target.name}.{uuid.uuid4().hex}.partial")
 
 
-def _replaceable(target: Path, marker: str) -> bool:
-    return target.is_dir() and ((target / marker).is_file() or not any(target.iterdir()))
+def _check_replaceable(target: Path, marker: str) -> None:
+    if target.exists() and not (target.is_dir() and ((target / marker).is_file() or not any(target.iterdir()))):
+        raise FileFormatError(target, f"expected a new or empty folder, or one with {marker} to replace")
 
 
 def _take_over(partial: Path, target: Path) -> None:

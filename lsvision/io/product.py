@@ -18,68 +18,52 @@ from torch import Tensor
 from zarr.codecs import ZstdCodec
 
 from lsvision.errors import FileFormatError
-from lsvision.io.atomic import partial_folder
-from lsvision.io.bands import NUMPY_DTYPES
+from lsvision.io.atomic import partial_folder, replace_folder
+from lsvision.io.bands import NUMPY_DTYPES, TORCH_DTYPES
 from lsvision.io.tiff import ZSTD_LEVEL
 from lsvision.io.validation import Fields
 
 PRODUCT_FORMAT = "lsvision-product/1"
 _ROOT_METADATA = "zarr.json"
+_IMAGES = ("color", "height", "valid", "source")
 
 
-class ProductWriter:
-    """Context manager that writes a product by blocks of rows; it appears under its name when the block ends well.
+@dataclass(frozen=True)
+class ProductLayout:
+    """What a product's images look like before anything is in them.
 
-    Rows lie along q_y, columns along q_x. Rows never written stay invalid. Blocks that are whole chunks are written
-    fastest.
-
-    Args:
-        path: final folder (``<scan>.zarr``): new, empty, or an earlier product to replace.
-        shape: (rows, columns) of the grid.
-        pitch_mm: side of its square cells.
-        origin_mm: (q_y, q_x) of the centre of cell (0, 0).
-        channels: of the colour image, 1 or 3.
-        dtype: of the colour image, uint8 or uint16.
-        chunk_rows: rows of a chunk; it holds all columns.
-        metadata: plain data kept with the product.
+    ``shape`` is (rows, columns) of the grid, ``pitch_mm`` the side of its square cells, ``origin_mm`` the (q_y, q_x) of
+    the centre of cell (0, 0); ``channels`` (1 or 3) and ``dtype`` (uint8 or uint16) are those of the colour image. A
+    chunk holds ``chunk_rows`` rows and all columns. ``metadata`` is plain data kept with the product.
     """
 
-    def __init__(
-        self,
-        path: Path | str,
-        *,
-        shape: tuple[int, int],
-        pitch_mm: float,
-        origin_mm: tuple[float, float],
-        channels: int,
-        dtype: torch.dtype,
-        chunk_rows: int,
-        metadata: Mapping[str, object],
-    ) -> None:
-        self._path, self._shape, self._chunk_rows = Path(path), shape, chunk_rows
-        self._pitch_mm, self._origin_mm = pitch_mm, origin_mm
-        self._channels, self._dtype, self._metadata = channels, dtype, metadata
-        self._stack = ExitStack()
-        self._arrays: dict[str, Any] = {}
+    shape: tuple[int, int]
+    pitch_mm: float
+    origin_mm: tuple[float, float]
+    channels: int
+    dtype: torch.dtype
+    chunk_rows: int
+    metadata: Mapping[str, object]
 
-    def __enter__(self) -> "ProductWriter":
-        with ExitStack() as stack:
-            folder = stack.enter_context(partial_folder(self._path, marker=_ROOT_METADATA))
-            attributes = {"lsvision": {**self._metadata, "format": PRODUCT_FORMAT}}
-            root = zarr.open_group(folder, mode="w", zarr_format=3, attributes=attributes)
-            self._arrays = {
-                "color": self._create(root, "color", NUMPY_DTYPES[self._dtype], 0, self._channels),
-                "height": self._create(root, "height", np.float32, np.nan),
-                "valid": self._create(root, "valid", np.bool_, False),
-                "source": self._create(root, "source", np.float32, np.nan, 2),
-            }
-            self._stack = stack.pop_all()
-        return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> bool | None:
-        return self._stack.__exit__(kind, error, trace)
+class ProductRows:
+    """The images of a product that is being written, in a folder that is not its final one.
+
+    Several processes may each write rows of their own at once as long as no two share a chunk.
+
+    Args:
+        folder: what ``create_product`` made.
+
+    Raises:
+        FileFormatError: the folder holds no product.
+    """
+
+    def __init__(self, folder: Path | str) -> None:
+        try:
+            root = zarr.open_group(folder, mode="r+")
+            self._arrays: dict[str, Any] = {name: root[f"{name}/0"] for name in _IMAGES}
+        except Exception as error:  # damaged metadata surfaces as any of a dozen types
+            raise FileFormatError(folder, f"not a product to be written: {error}") from error
 
     def write(
         self,
@@ -101,37 +85,112 @@ class ProductWriter:
         Raises:
             ValueError: a block of another shape or dtype, or outside the grid.
         """
-        rows = len(height)
-        if row < 0 or row + rows > self._shape[0]:
-            raise ValueError(f"row: expected a block within 0..{self._shape[0]}, got {row}..{row + rows}")
-        plane = (rows, self._shape[1])
-        self._check("color", color, (*plane, self._channels), self._dtype)
-        self._check("height", height, plane, torch.float32)
-        self._check("valid", valid, plane, torch.bool)
-        self._check("source", source, (*plane, 2), torch.float32)
+        rows, (grid_rows, columns) = len(height), self._arrays["height"].shape
+        if row < 0 or row + rows > grid_rows:
+            raise ValueError(f"row: expected a block within 0..{grid_rows}, got {row}..{row + rows}")
+        image = self._arrays["color"]
+        _check("color", color, (rows, columns, image.shape[0]), TORCH_DTYPES[np.dtype(image.dtype)])
+        _check("height", height, (rows, columns), torch.float32)
+        _check("valid", valid, (rows, columns), torch.bool)
+        _check("source", source, (rows, columns, 2), torch.float32)
         for name, block in (("height", height), ("valid", valid)):
             self._arrays[name][row : row + rows] = block.numpy(force=True)
         for name, block in (("color", color), ("source", source)):
             self._arrays[name][:, row : row + rows] = block.movedim(-1, 0).numpy(force=True)
 
-    def _create(self, root: Any, name: str, dtype: Any, fill: object, channels: int = 0) -> Any:
-        axes = ("c", "y", "x") if channels else ("y", "x")
-        leading = (channels,) if channels else ()
-        group = root.create_group(name, attributes={"ome": _multiscales(name, axes, self._pitch_mm, self._origin_mm)})
-        return group.create_array(
-            "0",
-            shape=(*leading, *self._shape),
-            chunks=(*leading, min(self._chunk_rows, self._shape[0]), self._shape[1]),
-            dtype=dtype,
-            fill_value=fill,
-            compressors=[ZstdCodec(level=ZSTD_LEVEL)],
-            dimension_names=axes,
-        )
 
-    @staticmethod
-    def _check(name: str, block: Tensor, shape: tuple[int, ...], dtype: torch.dtype) -> None:
-        if tuple(block.shape) != shape or block.dtype != dtype:
-            raise ValueError(f"{name}: expected {shape} {dtype}, got {tuple(block.shape)} {block.dtype}")
+def create_product(folder: Path | str, layout: ProductLayout) -> ProductRows:
+    """Lay out an empty product, all of it invalid, in a folder that takes the product's name when it is complete."""
+    attributes = {"lsvision": {**layout.metadata, "format": PRODUCT_FORMAT}}
+    root = zarr.open_group(folder, mode="w", zarr_format=3, attributes=attributes)
+    _create_image(root, layout, "color", NUMPY_DTYPES[layout.dtype], 0, layout.channels)
+    _create_image(root, layout, "height", np.float32, np.nan)
+    _create_image(root, layout, "valid", np.bool_, False)
+    _create_image(root, layout, "source", np.float32, np.nan, 2)
+    return ProductRows(folder)
+
+
+def complete_product(folder: Path | str, target: Path | str) -> None:
+    """Give a product whose rows are all written its final name; an earlier product there is replaced.
+
+    Raises:
+        FileFormatError: ``target`` holds something else.
+    """
+    replace_folder(folder, target, marker=_ROOT_METADATA)
+
+
+class ProductWriter:
+    """Context manager that writes a product by blocks of rows; it appears under its name when the block ends well.
+
+    Rows lie along q_y, columns along q_x. Rows never written stay invalid. Blocks that are whole chunks are written
+    fastest.
+
+    Args:
+        path: final folder (``<scan>.zarr``): new, empty, or an earlier product to replace.
+        shape, pitch_mm, origin_mm, channels, dtype, chunk_rows, metadata: see ``ProductLayout``.
+    """
+
+    def __init__(
+        self,
+        path: Path | str,
+        *,
+        shape: tuple[int, int],
+        pitch_mm: float,
+        origin_mm: tuple[float, float],
+        channels: int,
+        dtype: torch.dtype,
+        chunk_rows: int,
+        metadata: Mapping[str, object],
+    ) -> None:
+        self._path = Path(path)
+        self._layout = ProductLayout(shape, pitch_mm, origin_mm, channels, dtype, chunk_rows, metadata)
+        self._stack = ExitStack()
+        self._rows: ProductRows | None = None
+
+    def __enter__(self) -> "ProductWriter":
+        with ExitStack() as stack:
+            folder = stack.enter_context(partial_folder(self._path, marker=_ROOT_METADATA))
+            self._rows = create_product(folder, self._layout)
+            self._stack = stack.pop_all()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> bool | None:
+        return self._stack.__exit__(kind, error, trace)
+
+    def write(
+        self,
+        row: int,
+        color: Tensor,
+        height: Float[Tensor, "rows columns"],
+        valid: Bool[Tensor, "rows columns"],
+        source: Float[Tensor, "rows columns 2"],
+    ) -> None:
+        """Write a block of rows; arguments and errors as of ``ProductRows.write``."""
+        if self._rows is None:
+            raise ValueError("write: the writer is used as a context manager")
+        self._rows.write(row, color, height, valid, source)
+
+
+def _create_image(root: Any, layout: ProductLayout, name: str, dtype: Any, fill: object, channels: int = 0) -> None:
+    axes = ("c", "y", "x") if channels else ("y", "x")
+    leading = (channels,) if channels else ()
+    group = root.create_group(name, attributes={"ome": _multiscales(name, axes, layout.pitch_mm, layout.origin_mm)})
+    group.create_array(
+        "0",
+        shape=(*leading, *layout.shape),
+        chunks=(*leading, min(layout.chunk_rows, layout.shape[0]), layout.shape[1]),
+        dtype=dtype,
+        fill_value=fill,
+        compressors=[ZstdCodec(level=ZSTD_LEVEL)],
+        dimension_names=axes,
+    )
+
+
+def _check(name: str, block: Tensor, shape: tuple[int, ...], dtype: torch.dtype) -> None:
+    if tuple(block.shape) != shape or block.dtype != dtype:
+        raise ValueError(f"{name}: expected {shape} {dtype}, got {tuple(block.shape)} {block.dtype}")
 
 
 @dataclass(frozen=True)

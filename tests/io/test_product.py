@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from lsvision.errors import FileFormatError
-from lsvision.io import ProductWriter, read_product
+from lsvision.io import ProductLayout, ProductRows, ProductWriter, complete_product, create_product, read_product
 
 ROWS, COLUMNS = 70, 12
 OPTIONS = {
@@ -151,3 +151,28 @@ def test_origin_and_pitch_are_exact(tmp_path: Path) -> None:
         pass
     product = read_product(tmp_path / "a.zarr")
     assert (product.origin_mm, product.pitch_mm) == (origin, 0.1 + 0.2)
+
+
+def test_rows_written_in_place_by_several_writers_make_the_same_product(tmp_path: Path) -> None:
+    written = planes()
+    layout = ProductLayout(**OPTIONS)
+    create_product(tmp_path / "partial", layout)
+    for start, stop in [(64, 70), (0, 32), (32, 64)]:
+        ProductRows(tmp_path / "partial").write(start, *(plane[start:stop] for plane in written))
+    complete_product(tmp_path / "partial", tmp_path / "a.zarr")
+    assert [path.name for path in tmp_path.iterdir()] == ["a.zarr"]
+    np.testing.assert_array_equal(read_product(tmp_path / "a.zarr").height(0, ROWS), written[1])
+
+
+def test_rows_of_what_is_not_a_product(tmp_path: Path) -> None:
+    with pytest.raises(FileFormatError, match="not a product to be written"):
+        ProductRows(tmp_path)
+
+
+def test_a_complete_product_takes_the_place_of_a_product_only(tmp_path: Path) -> None:
+    create_product(tmp_path / "partial", ProductLayout(**OPTIONS))
+    (tmp_path / "a.zarr").mkdir()
+    (tmp_path / "a.zarr" / "notes.txt").write_text("keep")
+    with pytest.raises(FileFormatError, match="to replace"):
+        complete_product(tmp_path / "partial", tmp_path / "a.zarr")
+    assert (tmp_path / "a.zarr" / "notes.txt").is_file()
