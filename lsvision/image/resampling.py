@@ -1,54 +1,147 @@
-"""Resampling of image strips at given positions by ``grid_sample``."""
+"""Resampling of images at given positions, by ``grid_sample`` or by OpenCV."""
 
 import math
 from typing import Literal
 
+import cv2
 import torch
 import torch.nn.functional as F  # noqa: N812
 from jaxtyping import Float
 from torch import Tensor
 
 Interpolation = Literal["bilinear", "bicubic"]
+Resampler = Literal["grid_sample", "opencv"]
 
-# Positions along Y are rounded to this part of a line: float32 holds such a fraction of up to 8192 lines exactly.
-_LINE_PARTS = 2048
+# Positions are rounded to this part of a pixel: float32 holds such a fraction of up to 8192 pixels exactly.
+_PARTS = 2048
+_LARGEST_WINDOW = 8192
+_REACH = 2  # pixels that an interpolation looks at beside a position
+_TAIL = 3.0  # standard deviations at which a Gaussian is cut off
+_CV2_MODES = {"bilinear": cv2.INTER_LINEAR, "bicubic": cv2.INTER_CUBIC}
 
 
 def sample_image(
-    image: Tensor, column: Float[Tensor, "rows columns"], line: Float[Tensor, "rows columns"], mode: Interpolation
+    image: Tensor,
+    column: Float[Tensor, "rows columns"],
+    line: Float[Tensor, "rows columns"],
+    mode: Interpolation,
+    *,
+    coarser: tuple[float, float] = (1.0, 1.0),
+    resampler: Resampler = "grid_sample",
 ) -> Tensor:
     """Sample an image ``(lines, width, channels)`` at positions in px; ``(rows, columns, channels)`` of its dtype.
 
-    Positions are relative to the image's first line, and lines are rounded to 1/2048: cut from a taller image, at any
-    line, an image gives the same bits. Positions outside are clamped to the rim; NaN positions give 0.
+    Positions are rounded to 1/2048 px: cut from a larger image, at any place, an image gives the same bits, up to the
+    rim of ``sampling_reach``. Positions outside are clamped to the rim; NaN positions give 0.
+
+    Args:
+        coarser: distance of neighbouring samples in lines and in columns; where it exceeds 1, the image is smoothed
+            first, so that no detail finer than the samples turns into a false pattern.
+
+    Raises:
+        ValueError: the positions spread over more than 8192 px; sample tile by tile.
     """
-    lines, width, _ = image.shape
-    known = torch.isfinite(column) & torch.isfinite(line)
-    # With a power of two of lines grid_sample's way from a normalised position back to lines rounds nothing.
-    intervals = 2 ** math.ceil(math.log2(max(lines - 1, 1)))
-    line = (line * _LINE_PARTS).round() / _LINE_PARTS
-    grid = torch.stack([2 * column / max(width - 1, 1) - 1, 2 * line / intervals - 1], dim=-1)
-    grid = torch.where(known[..., None], grid, 0.0).to(torch.float32)
-    source = image.to(torch.float32).movedim(-1, 0)[None]
-    source = F.pad(source, (0, 0, 0, intervals + 1 - lines), mode="replicate")
-    # grid_sample gives each item of the batch a thread of its own: bands of rows over one shared image.
-    bands = _bands(grid, torch.get_num_threads())
-    sampled = F.grid_sample(
-        source.expand(bands.shape[0], *source.shape[1:]), bands, mode=mode, padding_mode="border", align_corners=True
+    known = torch.isfinite(column + line)
+    complete = bool(known.all())
+    if not (complete or bool(known.any())):
+        return image.new_zeros(*column.shape, image.shape[2])
+    row, lines = _along(line, None if complete else known, image.shape[0])
+    place, columns = _along(column, None if complete else known, image.shape[1])
+    window = _window(image, lines, columns, coarser)
+    sample = _remap if resampler == "opencv" else _grid_sample
+    sampled = sample(window, place, row, mode)
+    if image.dtype != sampled.dtype:
+        sampled = sampled.round_().clamp_(0.0, float(torch.iinfo(image.dtype).max)).to(image.dtype)
+    return sampled if complete else torch.where(known[..., None], sampled, 0)
+
+
+def sampling_reach(coarser: float) -> int:
+    """Pixels beside a position that its value depends on, where samples lie ``coarser`` pixels apart."""
+    return _REACH + _radius(coarser)
+
+
+def _along(position: Tensor, known: Tensor | None, size: int) -> tuple[Tensor, tuple[int, int]]:
+    """Positions on one axis in rounded parts from the start of the window they need, float32; and that window."""
+    position = position.clamp(0, size - 1)
+    if known is None:
+        low, high = (float(end) for end in torch.aminmax(position))
+    else:
+        low = float(torch.where(known, position, math.inf).amin())
+        high = float(torch.where(known, position, -math.inf).amax())
+    start, stop = math.floor(low) - _REACH, math.ceil(high) + _REACH + 1
+    if stop - start > _LARGEST_WINDOW:
+        raise ValueError(f"positions: expected a spread of at most {_LARGEST_WINDOW} px, got {stop - start}")
+    return position.sub_(start).mul_(_PARTS).round_().to(torch.float32), (start, stop)
+
+
+def _window(image: Tensor, lines: tuple[int, int], columns: tuple[int, int], coarser: tuple[float, float]) -> Tensor:
+    """Part of an image, continued past its rim by its own edge; where samples are coarser, smoothed and float32."""
+    for axis, (start, stop), spacing in ((0, lines, coarser[0]), (1, columns, coarser[1])):
+        radius = _radius(spacing)
+        low, high = start - radius, stop + radius
+        inside = image.narrow(axis, max(low, 0), min(high, image.shape[axis]) - max(low, 0))
+        image = _continued(inside, axis, max(-low, 0), max(high - image.shape[axis], 0))
+    for axis, spacing in enumerate(coarser):
+        image = _smoothed(image, axis, spacing)
+    return image
+
+
+def _continued(image: Tensor, axis: int, before: int, after: int) -> Tensor:
+    """An image with its first and last line (axis 0) or column (axis 1) repeated."""
+    if before == after == 0:
+        return image
+    shape = list(image.shape)
+    edges = []
+    for place, times in ((0, before), (image.shape[axis] - 1, after)):
+        shape[axis] = times
+        edges.append(image.narrow(axis, place, 1).expand(shape))
+    return torch.cat([edges[0], image, edges[1]], dim=axis)
+
+
+def _radius(coarser: float) -> int:
+    return math.ceil(_TAIL * _sigma(coarser)) if coarser > 1 else 0
+
+
+def _sigma(coarser: float) -> float:
+    # A sample stands for a Gaussian of half its spacing; what the pixel's own width already blurs is taken off.
+    return 0.5 * math.sqrt(coarser**2 - 1)
+
+
+def _smoothed(image: Tensor, axis: int, coarser: float) -> Tensor:
+    """Gaussian filter along an axis, without the radius at its ends; tap by tap, so that no bit depends on the size."""
+    radius = _radius(coarser)
+    if radius == 0:
+        return image
+    offset = torch.arange(-radius, radius + 1, dtype=torch.float64)
+    weight = torch.exp(-0.5 * (offset / _sigma(coarser)).square())
+    taps = (weight / weight.sum()).tolist()
+    image = image.to(torch.float32)
+    length = image.shape[axis] - 2 * radius
+    smooth = image.narrow(axis, 0, length) * taps[0]
+    for start, tap in enumerate(taps[1:], start=1):
+        smooth += image.narrow(axis, start, length) * tap
+    return smooth
+
+
+def _grid_sample(window: Tensor, column: Tensor, line: Tensor, mode: Interpolation) -> Tensor:
+    height, width, channels = window.shape
+    # With a power of two of intervals, grid_sample's way from a normalised position back to pixels rounds nothing.
+    intervals = [2 ** math.ceil(math.log2(size - 1)) for size in (height, width)]
+    # What lies beyond the window is never looked at, and need not be filled.
+    source = column.new_empty(channels, intervals[0] + 1, intervals[1] + 1)
+    source[:, :height, :width] = window.movedim(-1, 0)
+    grid = torch.stack(
+        [
+            position.mul_(2 / (_PARTS * size)).sub_(1)
+            for position, size in zip((column, line), intervals[::-1], strict=True)
+        ],
+        -1,
     )
-    sampled = sampled.movedim(1, -1).flatten(0, 1)[: column.shape[0]]
-    sampled = torch.where(known[..., None], sampled, 0.0)
-    if image.dtype.is_floating_point:
-        return sampled.to(image.dtype)
-    top = float(torch.iinfo(image.dtype).max)
-    return sampled.round_().clamp_(0.0, top).to(image.dtype)
+    sampled = F.grid_sample(source[None], grid[None], mode=mode, padding_mode="border", align_corners=True)
+    return sampled[0].movedim(0, -1)
 
 
-def _bands(grid: Tensor, threads: int) -> Tensor:
-    """Split rows into equal bands, (bands, rows, columns, 2); the last is padded with copies of the last row."""
-    rows = grid.shape[0]
-    count = max(1, min(threads, rows))
-    height = -(-rows // count)
-    missing = height * count - rows
-    padded = torch.cat([grid, grid[-1:].expand(missing, -1, -1)]) if missing else grid
-    return padded.reshape(count, height, *grid.shape[1:])
+def _remap(window: Tensor, column: Tensor, line: Tensor, mode: Interpolation) -> Tensor:
+    across, along = (position.div_(_PARTS).numpy() for position in (column, line))
+    sampled = cv2.remap(window.numpy(), across, along, _CV2_MODES[mode], borderMode=cv2.BORDER_REPLICATE)
+    return torch.from_numpy(sampled).reshape(*column.shape, window.shape[2])

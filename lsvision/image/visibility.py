@@ -14,7 +14,7 @@ def visible_segments(
     """Find, line by line, the segment between neighbouring samples that covers each integer cell.
 
     Segments that run backwards are seen from behind and do not count. Where several segments cover a cell, the one of
-    least depth there wins: a step or an overhang shows its nearer side.
+    least depth there wins: a step or an overhang shows its nearer side. Of equals the later one does.
 
     Args:
         position: coordinate of each sample on the axis, in cells; may be NaN.
@@ -25,37 +25,63 @@ def visible_segments(
     Returns:
         Index i of the segment (i, i + 1), -1 where nothing covers the cell, and the fraction 0..1 along it.
     """
-    lines = position.shape[0]
-    low, high = position[:, :-1], position[:, 1:]
-    usable = connected & (high > low) & (high > 0) & (low < cells)
-    first = torch.where(usable, low, 0.0).clamp(min=0).ceil()
-    count = torch.where(usable, (high.clamp(max=cells) - first).ceil(), 0.0)
-    most = int(count.max()) if count.numel() else 0
-    segment = torch.full((lines, cells), -1, dtype=torch.long, device=position.device)
-    if most == 0:
-        return segment, torch.zeros_like(position[:, :1]).expand(lines, cells)
-
-    # A segment covers at most `most` cells, one or two as a rule: each candidate bids for its cell with its depth.
-    offset = torch.arange(most, device=position.device)
-    bids = offset < count[..., None]
-    cell = torch.where(bids, first[..., None].long() + offset, cells).flatten(1)
-    fraction = ((first[..., None] + offset - low[..., None]) / (high - low)[..., None]).flatten(1)
-    begin, end = (side[..., None].expand(bids.shape).flatten(1) for side in (depth[:, :-1], depth[:, 1:]))
-    bid_depth = torch.lerp(begin, end, fraction)
-    bid_depth = torch.where(bids.flatten(1), bid_depth, torch.inf)
-    nearest = torch.full((lines, cells + 1), torch.inf, dtype=depth.dtype, device=depth.device)
-    nearest.scatter_reduce_(1, cell, bid_depth, "amin")
-    wins = bids.flatten(1) & (bid_depth == nearest.gather(1, cell))
-
-    # Equal bids: the later segment, so that the result does not depend on the order of the scatter.
-    index = torch.arange(low.shape[1], device=position.device)[:, None].expand(-1, most).reshape(1, -1).expand_as(cell)
-    padded = torch.nn.functional.pad(segment, (0, 1), value=-1)
-    padded.scatter_reduce_(1, torch.where(wins, cell, cells), torch.where(wins, index, -1), "amax")
-    segment = padded[:, :cells]
+    following = position.ceil()
+    first = following[:, :-1].clamp(min=0)
+    count = torch.where(connected, following[:, 1:].clamp(max=cells) - first, 0.0)
+    segment = _claimed_cells(position, depth, first, count, cells)
     start = segment.clamp(min=0)
     axis = torch.arange(cells, dtype=position.dtype, device=position.device)
     before, after = position.gather(1, start), position.gather(1, start + 1)
     return segment, torch.where(segment >= 0, (axis - before) / (after - before), 0.0)
+
+
+def _claimed_cells(position: Tensor, depth: Tensor, first: Tensor, count: Tensor, cells: int) -> Tensor:
+    """Winning segment of every cell, -1 for none, of segments that cover ``count`` cells from ``first`` on.
+
+    Nearly every segment covers one cell and nearly every cell one segment. So all claim their first cell at once,
+    whoever comes last keeps it, and only the few further cells and the few disputes are looked at one by one.
+    """
+    lines, segments = first.shape
+    index = torch.arange(segments, device=first.device).expand(lines, segments)
+    claims = count > 0
+    cell = torch.where(claims, first, float(cells)).long()
+    held = torch.full((lines, cells + 1), -1, dtype=torch.long, device=first.device)  # the last column is refuse
+    held.scatter_(1, cell, index)
+
+    line, begin = (count > 1).nonzero().unbind(1)
+    times = count[line, begin].long() - 1
+    offset = torch.arange(1, 1 + int(times.sum()), device=first.device)
+    offset = offset - (times.cumsum(0) - times).repeat_interleave(times)
+    line, begin = line.repeat_interleave(times), begin.repeat_interleave(times)
+    further = cell[line, begin] + offset
+    held[line, further] = begin
+
+    lost = claims & (held.gather(1, cell) != index)
+    lost_line, lost_segment = lost.nonzero().unbind(1)
+    also = held[line, further] != begin
+    disputes = [
+        torch.cat([lost_line, line[also]]),
+        torch.cat([lost_segment, begin[also]]),
+        torch.cat([cell[lost_line, lost_segment], further[also]]),
+    ]
+    if disputes[0].numel():
+        _settle(held, position, depth, *disputes)
+    return held[:, :cells]
+
+
+def _settle(held: Tensor, position: Tensor, depth: Tensor, line: Tensor, segment: Tensor, cell: Tensor) -> None:
+    """Give every disputed cell to the nearest of its present holder and the segments that lost it; in place."""
+    disputed, which = torch.unique(line * held.shape[1] + cell, return_inverse=True)
+    holder = held.view(-1)[disputed]
+    line = torch.cat([line, disputed // held.shape[1]])
+    segment = torch.cat([segment, holder])
+    cell = torch.cat([cell, disputed % held.shape[1]])
+    which = torch.cat([which, torch.arange(disputed.numel(), device=held.device)])
+    low, high = position[line, segment], position[line, segment + 1]
+    seen = torch.lerp(depth[line, segment], depth[line, segment + 1], ((cell - low) / (high - low)).to(depth.dtype))
+    nearest = torch.full_like(disputed, torch.inf, dtype=seen.dtype).scatter_reduce_(0, which, seen, "amin")
+    wins = torch.where(seen == nearest[which], segment, -1)
+    held.view(-1)[disputed] = torch.full_like(disputed, -1).scatter_reduce_(0, which, wins, "amax")
 
 
 def interpolate_segments(
@@ -81,9 +107,11 @@ def bridge_gaps(
     Args:
         largest_step: largest change per sample between the ends; beyond it the hole hides a step and stays open.
     """
+    known = torch.isfinite(values)
+    if bool(known.all()):
+        return values
     samples = values.shape[1]
     index = torch.arange(samples, device=values.device).expand(values.shape)
-    known = torch.isfinite(values)
     before = torch.where(known, index, -1).cummax(1).values
     after = torch.where(known, index, samples).flip(1).cummin(1).values.flip(1)
     span = after - before
