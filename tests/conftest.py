@@ -2,12 +2,19 @@
 
 from pathlib import Path
 
+import hypothesis
 import jaxtyping
 import pytest
 
 jaxtyping.install_import_hook(["lsvision.geometry", "lsvision.estimation", "lsvision.image"], "beartype.beartype")
 
 import torch  # noqa: E402
+
+torch.set_num_threads(1)  # before the fixtures of wider scope; xdist's workers share the processor
+
+# The same examples every time, and no clock: a slow machine is no failure.
+hypothesis.settings.register_profile("seeded", derandomize=True, deadline=None)
+hypothesis.settings.load_profile("seeded")
 
 SHARED_DATA = Path(__file__).parents[2] / "shared" / "data"
 

@@ -96,7 +96,7 @@ def write_scan(
             write_encoder(travel.positions_mm, partial / "encoder.csv")
         for name, content in extra_json.items():
             write_text(partial / name, dumps(content, indent=2, allow_nan=False) + "\n")
-        write_text(partial / SCAN_FILE, yaml.safe_dump(data, sort_keys=False, allow_unicode=True))
+        write_text(partial / SCAN_FILE, yaml.safe_dump(data, sort_keys=False))
 
 
 def _scan_data(travel: Travel, attributes: Mapping[str, str], color_registered: bool, second: str) -> dict[str, object]:

@@ -8,6 +8,9 @@ import pytest
 
 from lsvision import run
 
+# Test processes share the processor already; "++" because a run without an experiment has no such option yet.
+ONE_THREAD = ("++threads=1",)
+
 
 @pytest.fixture
 def command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., int]:
@@ -15,7 +18,7 @@ def command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., in
     monkeypatch.chdir(tmp_path)
 
     def call(*overrides: str, folder: str = "run") -> int:
-        monkeypatch.setattr(sys, "argv", ["lsvision", *overrides, f"hydra.run.dir={tmp_path / folder}"])
+        monkeypatch.setattr(sys, "argv", ["lsvision", *overrides, *ONE_THREAD, f"hydra.run.dir={tmp_path / folder}"])
         try:
             run.main()
         except SystemExit as stop:

@@ -29,6 +29,7 @@ def scans(tmp_path_factory):
                 [
                     "+experiment=simulate",
                     "scale=8",
+                    "threads=1",
                     f"scene.pitch_deg={pitch}",
                     f"scene.roll_deg={roll}",
                     f"scene.yaw_deg={yaw}",
