@@ -9,6 +9,7 @@ from lsvision.experiments.correct import CorrectSettings, run_correct
 from lsvision.experiments.paper import PaperSettings, run_paper
 from lsvision.experiments.settings import RunSettings
 from lsvision.experiments.simulate import SimulateSettings, run_simulate
+from lsvision.experiments.study import StudySettings, run_study
 
 # By name: the function and the schema of its options.
 EXPERIMENTS: dict[str, tuple[Callable[[Any, Path], None], type[RunSettings]]] = {
@@ -16,4 +17,5 @@ EXPERIMENTS: dict[str, tuple[Callable[[Any, Path], None], type[RunSettings]]] = 
     "simulate": (run_simulate, SimulateSettings),
     "calibrate": (run_calibrate, CalibrateSettings),
     "correct": (run_correct, CorrectSettings),
+    "study": (run_study, StudySettings),
 }

@@ -2,14 +2,19 @@
 
 from lsvision.report.experiment_pages import calibration_report, product_report
 from lsvision.report.pages import Comparison, ReportFigure, Table, write_report
+from lsvision.report.study_figures import TiltMap
+from lsvision.report.study_pages import Study, study_report
 from lsvision.report.summary import calibration_summary
 
 __all__ = [
     "Comparison",
     "ReportFigure",
+    "Study",
     "Table",
+    "TiltMap",
     "calibration_report",
     "calibration_summary",
     "product_report",
+    "study_report",
     "write_report",
 ]

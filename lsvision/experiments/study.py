@@ -1,0 +1,93 @@
+"""``+experiment=study``: how good a calibration would be, by Monte Carlo through the library's own calibration."""
+
+import json
+import logging
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+
+import polars
+
+from lsvision.errors import ConfigError
+from lsvision.experiments.paper import BoardPose
+from lsvision.experiments.settings import RunSettings
+from lsvision.experiments.study_map import tilt_map
+from lsvision.experiments.study_points import Conditions, exact_corners, study_points
+from lsvision.experiments.study_runs import run_points
+from lsvision.experiments.study_tables import iterations_table, points_table, runs_table
+from lsvision.io import write_text
+from lsvision.io.atomic import partial_file
+from lsvision.report import Study, study_report
+from lsvision.stages.calibration import CalibrationConfig
+from lsvision.types import Board, Rig
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, kw_only=True)
+class StudySettings(RunSettings):
+    """Options of the experiment.
+
+    ``placings`` are sets of board poses by name, ``conditions`` what every point has but for the ``axes``: lists of
+    values by name of a condition, whose grid is studied. ``runs`` calibrations a point are made, ``batch`` at a time;
+    the batch changes the speed and the memory, not the result. ``calibration`` holds what the conditions do not.
+    """
+
+    title: str
+    rig: Rig
+    board: Board
+    placings: dict[str, list[BoardPose]]
+    conditions: Conditions
+    calibration: CalibrationConfig
+    axes: dict[str, list[float | int | str] | None] = field(default_factory=dict)
+    runs: int = 500
+    batch: int = 48
+    map_range_deg: float = 15.0
+    map_steps: int = 31
+
+
+def run_study(settings: StudySettings, folder: Path) -> None:
+    """Calibrate every point many times, write the tables, the summary and the report."""
+    for name in ("runs", "batch", "threads"):
+        if getattr(settings, name) < 1:
+            raise ConfigError(f"{name}: expected at least 1, got {getattr(settings, name)}")
+    points = study_points(settings.conditions, settings.axes)
+    corners = [exact_corners(settings.rig, settings.board, settings.placings, point) for point in points]
+    log.info("%d points of %d calibrations each", len(points), settings.runs)
+    results = run_points(
+        points,
+        corners,
+        settings.calibration,
+        runs=settings.runs,
+        batch=settings.batch,
+        seed=settings.seed,
+        threads=settings.threads,
+    )
+    runs = runs_table(points, corners, results)
+    study = Study(
+        title=settings.title,
+        axes=tuple(name for name, values in settings.axes.items() if values and len(values) > 1),
+        runs=runs,
+        points=points_table(points, corners, runs),
+        iterations=iterations_table(results),
+        tilts=tilt_map(settings.rig, settings.board, points[0], settings.map_range_deg, settings.map_steps),
+    )
+    for name in ("runs", "points", "iterations"):
+        _write_parquet(getattr(study, name), folder / f"{name}.parquet")
+    write_text(folder / "summary.json", json.dumps(_summary(study), indent=2) + "\n")
+    study_report(study, asdict(settings), folder)
+    log.info("wrote %s and runs, points and iterations as Parquet beside it", folder / "report.html")
+
+
+def _summary(study: Study) -> dict:
+    """Plain values: the study's size, and each point's conditions that vary with its figures of merit."""
+    merits = ("rms_n1", "rms_n2", "rms_n3", "error_over_bound", "nees", "rmse_after_mm", "converged", "prior_dominated")
+    return {
+        "points": len(study.points),
+        "calibrations": len(study.runs),
+        "results": study.points.select(*study.axes, *merits).to_dicts(),
+    }
+
+
+def _write_parquet(table: polars.DataFrame, path: Path) -> None:
+    with partial_file(path) as partial:
+        table.write_parquet(partial)
