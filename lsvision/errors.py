@@ -25,6 +25,10 @@ class FileFormatError(LsvisionError):
         return type(self), (self.path, self.problem, self.key)
 
 
+class WriteError(LsvisionError):
+    """A file that cannot be written, as on a full disk; names the file."""
+
+
 class BoardNotFoundError(LsvisionError):
     """A scan in which the calibration board was looked for and not found."""
 

@@ -2,16 +2,28 @@
 
 import json
 import logging
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 from lsvision import __version__
 from lsvision.experiments.progress import ProgressBars, progress_bars
 from lsvision.experiments.settings import RunSettings, settings_sha256
-from lsvision.io import ProductWriter, check_rig_match, read_calibration, read_product, read_scan, write_text
+from lsvision.image.tiling import keep_freed_memory
+from lsvision.io import (
+    ExportFormat,
+    ProductLayout,
+    ProductWriter,
+    check_rig_match,
+    export_product,
+    read_calibration,
+    read_product,
+    read_scan,
+    write_text,
+)
 from lsvision.report import product_report
-from lsvision.stages.correction import CorrectionConfig, correct_scan, plan_product
+from lsvision.stages.correction import CorrectionConfig, ProductGrid, correct_scan, plan_product
 from lsvision.stages.disparity import DisparityConfig, depth_of
+from lsvision.stages.uncertainty import drift_per_metre
 from lsvision.types import Motion, Scan
 
 log = logging.getLogger(__name__)
@@ -19,19 +31,27 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, kw_only=True)
 class CorrectSettings(RunSettings):
-    """Options of the experiment; the product is ``<scan's name>.zarr`` in ``output``, the run's folder if None."""
+    """Options of the experiment; the product is ``<scan's name>.zarr`` in ``output``, the run's folder if None.
+
+    The formats of ``export`` are written beside it.
+    """
 
     scan: str
     calibration: str
     disparity: DisparityConfig
     correction: CorrectionConfig
     repair_encoder: bool = False
+    export: list[ExportFormat] = field(default_factory=list)
     output: str | None = None
 
 
 @dataclass(frozen=True)
 class ProductSummary:
-    """Size of a product and how much of it was measured."""
+    """Size of a product, how much of it was measured, and how far off it may be.
+
+    ``drift_mm_per_m`` is what the calibration leaves open of (q_x, q_y, q_z), one standard deviation per metre of the
+    object.
+    """
 
     path: str
     rows: int
@@ -40,6 +60,7 @@ class ProductSummary:
     valid_share: float
     lowest_mm: float
     highest_mm: float
+    drift_mm_per_m: tuple[float, float, float]
 
 
 def run_correct(settings: CorrectSettings, folder: Path) -> None:
@@ -54,11 +75,16 @@ def run_correct(settings: CorrectSettings, folder: Path) -> None:
             scan, calibration.motion, settings.disparity, settings.correction, target, bars, metadata
         )
     write_text(folder / "summary.json", json.dumps(asdict(summary), indent=2) + "\n")
-    product_report(read_product(target), summary.valid_share, asdict(settings), folder)
+    product = read_product(target)
+    for name in settings.export:
+        for file in export_product(product, name, target.with_suffix("")):
+            log.info("wrote %s", file)
+    product_report(product, summary.valid_share, asdict(settings), folder)
     log.info(
-        "wrote %s: %d x %d cells of %.3f mm, %.1f %% measured, heights %.1f..%.1f mm",
+        "wrote %s: %d x %d cells of %.3f mm, %.1f %% measured, heights %.1f..%.1f mm, "
+        "drift per metre up to %.3f mm (one sigma)",
         target, summary.rows, summary.columns, summary.pitch_mm, 100 * summary.valid_share,
-        summary.lowest_mm, summary.highest_mm,
+        summary.lowest_mm, summary.highest_mm, max(summary.drift_mm_per_m),
     )  # fmt: skip
 
 
@@ -72,11 +98,28 @@ def write_product(
     metadata: dict | None = None,
 ) -> ProductSummary:
     """Stream a scan through disparity and correction into a product on disk."""
+    keep_freed_memory()
     grid = plan_product(scan, motion, correction)
+    layout = product_layout(scan, motion, correction, grid, metadata or {})
     bar = bars.start(f"correct {target.stem}", total=grid.rows)
     valid, low, high = 0, float("inf"), float("-inf")
-    with ProductWriter(
-        target,
+    with ProductWriter(target, layout) as writer:
+        for strip in correct_scan(scan, depth_of(scan, disparity), motion, correction, grid):
+            writer.write(strip.row, strip.color, strip.height, strip.valid, strip.source, strip.sigma)
+            bars.advance(bar, strip.color.shape[0])
+            if bool(strip.valid.any()):
+                measured = strip.height[strip.valid]
+                valid += measured.numel()
+                low, high = min(low, float(measured.min())), max(high, float(measured.max()))
+    share, drift = valid / (grid.rows * grid.columns), drift_per_metre(motion)
+    return ProductSummary(str(target), grid.rows, grid.columns, grid.pitch_mm, share, low, high, drift)
+
+
+def product_layout(
+    scan: Scan, motion: Motion, correction: CorrectionConfig, grid: ProductGrid, metadata: dict
+) -> ProductLayout:
+    """Layout of the product that a correction's strips fill, one chunk a strip."""
+    return ProductLayout(
         shape=(grid.rows, grid.columns),
         pitch_mm=grid.pitch_mm,
         origin_mm=(grid.origin_y_mm, grid.origin_x_mm),
@@ -89,15 +132,7 @@ def write_product(
             "n": motion.n.tolist(),
             "zero_disparity_mm": scan.rig.zero_disparity_mm,
             "attributes": dict(scan.attributes),
-            **(metadata or {}),
+            **metadata,
         },
-    ) as writer:
-        for strip in correct_scan(scan, depth_of(scan, disparity), motion, correction, grid):
-            writer.write(strip.row, strip.color, strip.height, strip.valid, strip.source)
-            bars.advance(bar, strip.color.shape[0])
-            if bool(strip.valid.any()):
-                measured = strip.height[strip.valid]
-                valid += measured.numel()
-                low, high = min(low, float(measured.min())), max(high, float(measured.max()))
-    share = valid / (grid.rows * grid.columns)
-    return ProductSummary(str(target), grid.rows, grid.columns, grid.pitch_mm, share, low, high)
+        uncertainty=correction.uncertainty,
+    )

@@ -4,29 +4,29 @@ from lsvision.io.atomic import write_text
 from lsvision.io.calibration import check_rig_match, read_calibration, write_calibration
 from lsvision.io.checksum import scan_sha256
 from lsvision.io.encoder import read_encoder, write_encoder
+from lsvision.io.export import ExportFormat, export_product
+from lsvision.io.las import write_laz
 from lsvision.io.line_image import open_line_image
 from lsvision.io.ply import write_ply
-from lsvision.io.product import (
-    Product,
-    ProductLayout,
-    ProductRows,
-    ProductWriter,
-    complete_product,
-    create_product,
-    read_product,
-)
+from lsvision.io.product import Product, read_product
+from lsvision.io.product_check import ProductCheck, check_product
+from lsvision.io.product_writer import ProductLayout, ProductRows, ProductWriter, complete_product, create_product
 from lsvision.io.rig import read_rig, rig_from_dict, rig_to_dict, write_rig
 from lsvision.io.scan import read_scan, write_scan
 from lsvision.io.tiff import write_line_image
 
 __all__ = [
+    "ExportFormat",
     "Product",
+    "ProductCheck",
     "ProductLayout",
     "ProductRows",
     "ProductWriter",
+    "check_product",
     "check_rig_match",
     "complete_product",
     "create_product",
+    "export_product",
     "open_line_image",
     "read_calibration",
     "read_encoder",
@@ -38,6 +38,7 @@ __all__ = [
     "scan_sha256",
     "write_calibration",
     "write_encoder",
+    "write_laz",
     "write_line_image",
     "write_ply",
     "write_rig",

@@ -1,5 +1,6 @@
 """Writing aside and renaming when complete: a final name never holds half a result."""
 
+import errno
 import os
 import shutil
 import uuid
@@ -7,18 +8,25 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from lsvision.errors import FileFormatError
+from lsvision.errors import FileFormatError, WriteError
 
 
 @contextmanager
 def partial_file(target: Path | str) -> Iterator[Path]:
-    """Yield a hidden path beside ``target`` to write to; it takes the target's name on success, else it is removed."""
+    """Yield a hidden path beside ``target`` to write to; it takes the target's name on success, else it is removed.
+
+    Raises:
+        WriteError: the disk is full.
+    """
     target = Path(target).resolve()
     target.parent.mkdir(parents=True, exist_ok=True)
     partial = _hidden_sibling(target)
     try:
         yield partial
         partial.replace(target)
+    except OSError as error:
+        _tell_full_disk(target, error)
+        raise
     finally:
         partial.unlink(missing_ok=True)
 
@@ -33,6 +41,7 @@ def partial_folder(target: Path | str, *, marker: str) -> Iterator[Path]:
 
     Raises:
         FileFormatError: ``target`` exists, is not empty and does not hold ``marker``.
+        WriteError: the disk is full.
     """
     target = Path(target).resolve()
     _check_replaceable(target, marker)
@@ -42,6 +51,9 @@ def partial_folder(target: Path | str, *, marker: str) -> Iterator[Path]:
     try:
         yield partial
         _take_over(partial, target)
+    except OSError as error:
+        _tell_full_disk(target, error)
+        raise
     finally:
         shutil.rmtree(partial, ignore_errors=True)
 
@@ -62,6 +74,11 @@ def write_text(path: Path | str, text: str) -> None:
     """Write a text file, UTF-8, in one step."""
     with partial_file(path) as partial:
         partial.write_text(text, encoding="utf-8")
+
+
+def _tell_full_disk(target: Path, error: OSError) -> None:
+    if error.errno in (errno.ENOSPC, errno.EDQUOT):
+        raise WriteError(f"{target}: cannot be written: {os.strerror(error.errno)}") from error
 
 
 def _hidden_sibling(target: Path) -> Path:

@@ -1,0 +1,78 @@
+"""``+experiment=validate``: re-read a product, every chunk against its checksum, and measure the board in it if any."""
+
+import json
+import logging
+import math
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from lsvision.experiments.settings import RunSettings
+from lsvision.io import Product, check_product, read_product, write_text
+from lsvision.stages.correction import ProductGrid
+from lsvision.stages.measurement import measure_board
+from lsvision.types import Board
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ValidateSettings(RunSettings):
+    """Options of the experiment: a product, and the board that may be seen in it."""
+
+    product: str
+    board: Board
+
+
+@dataclass(frozen=True)
+class ProductImage:
+    """One image of a product on disk, as a ``LineImage``."""
+
+    product: Product
+    name: str
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """(rows, columns, channels)."""
+        return *self.product.shape, self.read(0, 0).shape[2]
+
+    @property
+    def dtype(self) -> torch.dtype:
+        """That of the image."""
+        return self.read(0, 0).dtype
+
+    def read(self, start: int, stop: int) -> Tensor:
+        """Rows ``start..stop-1``."""
+        block: Tensor = getattr(self.product, self.name)(start, stop)
+        return block if block.ndim == 3 else block[..., None]
+
+
+def run_validate(settings: ValidateSettings, folder: Path) -> None:
+    """Check the product and say what is in it; a fault ends the run with the image and the rows at fault."""
+    check = check_product(settings.product)
+    product = read_product(settings.product)
+    log.info(
+        "%s is whole: %d x %d cells, %d levels, %.1f %% measured, heights %.3f..%.3f mm",
+        settings.product, check.rows, check.columns, check.levels, 100 * check.valid_share,
+        check.lowest_mm, check.highest_mm,
+    )  # fmt: skip
+    grid = ProductGrid(*product.shape, product.pitch_mm, *product.origin_mm)
+    board = measure_board(ProductImage(product, "color"), ProductImage(product, "height"), grid, settings.board)
+    summary = {name: value if math.isfinite(value) else None for name, value in asdict(check).items()}
+    if board is None:
+        log.info("no board of %d x %d squares in it", settings.board.columns, settings.board.rows)
+        summary["board"] = None
+    else:
+        found = int(board.valid.sum())
+        log.info(
+            "board: %d corners, distances off by %.4f mm rms between neighbours, %.4f mm between all",
+            found, board.neighbour_rms_mm, board.distance_rms_mm,
+        )  # fmt: skip
+        summary["board"] = {
+            "corners": found,
+            "neighbour_rms_mm": board.neighbour_rms_mm,
+            "distance_rms_mm": board.distance_rms_mm,
+        }
+    write_text(folder / "summary.json", json.dumps(summary, indent=2) + "\n")
