@@ -10,6 +10,7 @@ from lsvision.experiments.paper import PaperSettings, run_paper
 from lsvision.experiments.settings import RunSettings
 from lsvision.experiments.simulate import SimulateSettings, run_simulate
 from lsvision.experiments.study import StudySettings, run_study
+from lsvision.experiments.validate import ValidateSettings, run_validate
 
 # By name: the function and the schema of its options.
 EXPERIMENTS: dict[str, tuple[Callable[[Any, Path], None], type[RunSettings]]] = {
@@ -17,5 +18,6 @@ EXPERIMENTS: dict[str, tuple[Callable[[Any, Path], None], type[RunSettings]]] = 
     "simulate": (run_simulate, SimulateSettings),
     "calibrate": (run_calibrate, CalibrateSettings),
     "correct": (run_correct, CorrectSettings),
+    "validate": (run_validate, ValidateSettings),
     "study": (run_study, StudySettings),
 }
