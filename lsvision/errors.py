@@ -4,7 +4,9 @@ from pathlib import Path
 
 
 class LsvisionError(Exception):
-    """Base of the errors that a command reports in one line before it exits with code 1."""
+    """Base of the errors that a command reports in one line before it exits with their code."""
+
+    exit_code = 1
 
 
 class FileFormatError(LsvisionError):
@@ -39,3 +41,11 @@ class CalibrationError(LsvisionError):
 
 class ConfigError(LsvisionError):
     """An option whose value makes no sense; names the option."""
+
+
+class ScansFailedError(LsvisionError):
+    """A run over many scans of which some failed; the exit code is their number, up to 100."""
+
+    def __init__(self, failed: int, scans: int, where: str) -> None:
+        super().__init__(f"{failed} of {scans} scans failed; {where} says why")
+        self.exit_code = min(failed, 100)

@@ -45,13 +45,13 @@ def _run(config: DictConfig) -> None:
 
 @hydra.main(version_base="1.3", config_path=str(config_folder()), config_name="config")
 def main(config: DictConfig) -> None:
-    """Run the experiment that the configuration names; an expected failure is one line and exit code 1."""
+    """Run the experiment that the configuration names; an expected failure is one line and its exit code."""
     try:
         _run(config)
     except LsvisionError as error:
         _log_trace_to_file()
         print(f"error: {error}", file=sys.stderr)
-        raise SystemExit(1) from None
+        raise SystemExit(error.exit_code) from None
 
 
 def _log_trace_to_file() -> None:

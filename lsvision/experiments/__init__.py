@@ -7,6 +7,7 @@ from typing import Any
 from lsvision.experiments.calibrate import CalibrateSettings, run_calibrate
 from lsvision.experiments.correct import CorrectSettings, run_correct
 from lsvision.experiments.paper import PaperSettings, run_paper
+from lsvision.experiments.reprocess import ReprocessSettings, StatusSettings, run_reprocess, run_status
 from lsvision.experiments.settings import RunSettings
 from lsvision.experiments.simulate import SimulateSettings, run_simulate
 from lsvision.experiments.study import StudySettings, run_study
@@ -18,6 +19,8 @@ EXPERIMENTS: dict[str, tuple[Callable[[Any, Path], None], type[RunSettings]]] = 
     "simulate": (run_simulate, SimulateSettings),
     "calibrate": (run_calibrate, CalibrateSettings),
     "correct": (run_correct, CorrectSettings),
+    "reprocess": (run_reprocess, ReprocessSettings),
+    "status": (run_status, StatusSettings),
     "validate": (run_validate, ValidateSettings),
     "study": (run_study, StudySettings),
 }

@@ -8,11 +8,14 @@ from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
     Progress,
+    ProgressColumn,
+    Task,
     TaskID,
     TextColumn,
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
+from rich.text import Text
 
 
 class ProgressBars:
@@ -25,9 +28,17 @@ class ProgressBars:
         """Add a bar."""
         return self._progress.add_task(description, total=total)
 
-    def advance(self, bar: TaskID, amount: int = 1) -> None:
+    def advance(self, bar: TaskID, amount: float = 1) -> None:
         """Move a bar on."""
         self._progress.advance(bar, amount)
+
+
+class RateColumn(ProgressColumn):
+    """Lines, rows or scans a second."""
+
+    def render(self, task: Task) -> Text:
+        """The rate over the last half minute; nothing before there is one."""
+        return Text(f"{task.speed:,.0f}/s" if task.speed else "")
 
 
 @contextmanager
@@ -38,6 +49,7 @@ def progress_bars() -> Iterator[ProgressBars]:
         TextColumn("{task.description}"),
         BarColumn(),
         MofNCompleteColumn(),
+        RateColumn(),
         TimeElapsedColumn(),
         TimeRemainingColumn(),
     )

@@ -6,7 +6,7 @@ from pathlib import Path
 import yaml
 
 _BLOCK = 1 << 20
-_FILE_KEYS = ("rig", "left", "right", "depth", "encoder")
+FILE_KEYS = ("rig", "left", "right", "depth", "encoder")
 
 
 def scan_sha256(path: Path | str) -> str:
@@ -18,7 +18,7 @@ def scan_sha256(path: Path | str) -> str:
     path = Path(path)
     data = yaml.safe_load((path / "scan.yaml").read_text(encoding="utf-8"))
     digest = hashlib.sha256()
-    named = [path / data[key] for key in _FILE_KEYS if key in data]
+    named = [path / data[key] for key in FILE_KEYS if key in data]
     for entry in [path / "scan.yaml", *named]:
         files = sorted(file for file in entry.rglob("*") if file.is_file()) if entry.is_dir() else [entry]
         for file in files:

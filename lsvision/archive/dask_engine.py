@@ -1,0 +1,117 @@
+"""The engine that works on a Dask cluster."""
+
+import logging
+import os
+from concurrent.futures import CancelledError
+from contextlib import suppress
+from queue import Empty, SimpleQueue
+from types import TracebackType
+
+import dask
+from distributed import Client, Future, KilledWorker, LocalCluster
+
+from lsvision.archive.engine import MOST_DEATHS, Finished
+from lsvision.archive.tasks import Task, TaskResult, run_task
+from lsvision.errors import ConfigError, LsvisionError
+
+_LOOK_SECONDS = 1.0
+
+# Tasks wait at the scheduler, not at a worker: the death of one says something of its own task alone.
+_SETTINGS = {
+    "distributed.scheduler.allowed-failures": MOST_DEATHS - 1,
+    "distributed.scheduler.worker-saturation": 1.0,
+    "distributed.comm.timeouts.connect": "10s",
+}
+
+
+class DaskEngine:
+    """Workers of a scheduler, or of a local cluster where no address is given; they may come and go.
+
+    Args:
+        scheduler: address as ``tcp://host:8786``.
+        workers: of a local cluster.
+        worker_memory_mb: of a local cluster; a worker that takes far more is restarted.
+
+    Raises:
+        ConfigError: nothing answers at the address.
+    """
+
+    def __init__(self, scheduler: str | None, workers: int, worker_memory_mb: int) -> None:
+        self._done: SimpleQueue[Future] = SimpleQueue()
+        self._tasks: dict[Future, Task] = {}
+        self._settings = dask.config.set(_SETTINGS)
+        logging.getLogger("distributed").setLevel(logging.CRITICAL)  # what matters of it is in the results
+        self._cluster = None
+        if scheduler is None:
+            self._cluster = LocalCluster(
+                n_workers=workers,
+                threads_per_worker=1,
+                memory_limit=worker_memory_mb * 2**20 * 2,
+                dashboard_address=":0",
+                silence_logs=50,
+            )
+        try:
+            self._client = Client(scheduler or self._cluster, set_as_default=False, timeout="10s")
+        except (OSError, TimeoutError, ValueError) as error:
+            raise ConfigError(f"engine.scheduler: nothing answers at {scheduler}") from error
+
+        self._threads = self._count_threads()
+
+    def __enter__(self) -> "DaskEngine":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._client.close()
+        if self._cluster is not None:
+            self._cluster.close()
+        self._settings.__exit__(None, None, None)
+
+    @property
+    def dashboard(self) -> str:
+        """Address of the progress view."""
+        return str(self._client.dashboard_link)
+
+    @property
+    def capacity(self) -> int:
+        """A task a thread and as many waiting, so that no worker waits for this process."""
+        return 2 * max(1, self._threads)
+
+    def submit(self, task: Task) -> None:
+        """Hand a task to the scheduler."""
+        future = self._client.submit(run_task, task, key=f"{task.stage or 'step'}-{os.urandom(8).hex()}", pure=False)
+        self._tasks[future] = task
+        future.add_done_callback(self._done.put)
+
+    def collect(self) -> list[Finished]:
+        """Wait for a task; workers that died are the scheduler's concern.
+
+        Raises:
+            LsvisionError: the scheduler is gone.
+        """
+        while True:
+            if self._client.status != "running":
+                raise _lost()
+            self._threads = self._count_threads()
+            with suppress(Empty):
+                return [self._take(self._done.get(timeout=_LOOK_SECONDS))]
+
+    def _count_threads(self) -> int:
+        try:
+            return sum(self._client.nthreads().values())
+        except OSError as error:
+            raise _lost() from error
+
+    def _take(self, future: Future) -> Finished:
+        task = self._tasks.pop(future)
+        try:
+            return task, future.result()
+        except KilledWorker:
+            return task, TaskResult(error=f"{MOST_DEATHS} workers died at it, of memory or a signal")
+        except (CancelledError, OSError) as error:
+            raise _lost() from error
+
+
+def _lost() -> LsvisionError:
+    return LsvisionError("the Dask scheduler is gone; what was done is kept: run the same again to go on")

@@ -1,0 +1,67 @@
+"""The report of a reprocessed archive."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from lsvision.archive import ScanRow, product_path
+from lsvision.io import read_product
+from lsvision.report import Comparison, ReportFigure, Table, write_report
+from lsvision.report.drawing import new_figure, show_image, thinned
+
+_MOST_THUMBNAILS = 24
+_ACROSS = 6
+_ROWS = 1024
+
+
+def reprocess_report(
+    rows: Mapping[str, ScanRow], done: Sequence[ScanRow], output: Path, seconds: float, settings: dict, folder: Path
+) -> None:
+    """``report.html`` of a run: every scan of the archive, why some failed, and a look at what this run made.
+
+    Args:
+        rows: of all scans, as the ledger has them.
+        done: rows of those that this run worked on.
+    """
+    failed = [row for row in rows.values() if row.status == "failed"]
+    made = [row for row in done if row.status == "done"]
+    lines = sum(row.lines for row in made)
+    write_report(
+        folder,
+        title=f"Archive of {len(rows)} scans",
+        lead=f"{len(made)} scans were reprocessed into {output}, {len(rows) - len(made) - len(failed)} were up to date "
+        f"and {len(failed)} failed.",
+        headlines=[
+            Comparison("Done", str(len(made)), "by this run"),
+            Comparison("Failed", str(len(failed)), f"of {len(rows)} scans"),
+            Comparison("Lines", str(lines), f"in {seconds:.1f} s: {lines / max(seconds, 1e-9):.0f} lines a second"),
+        ],
+        tables=[
+            Table("Failed scans", ("scan", "reason"), [(row.scan, row.error) for row in failed]),
+            Table(
+                "Scans",
+                ("scan", "status", "lines", "measured [%]", "work [s]", "calibration"),
+                [
+                    (row.scan, row.status, str(row.lines), f"{100 * row.measured:.1f}", f"{row.seconds:.1f}",
+                     Path(row.calibration).name)
+                    for row in rows.values()
+                ],
+            ),
+        ],
+        figures=[_thumbnails(made, output)] if made else [],
+        settings=settings,
+    )  # fmt: skip
+
+
+def _thumbnails(made: Sequence[ScanRow], output: Path) -> ReportFigure:
+    shown = made[:_MOST_THUMBNAILS]
+    down, across = -(-len(shown) // _ACROSS), min(_ACROSS, len(shown))
+    figure, axes = new_figure(1.9 * across, 2.1 * down, down, across, squeeze=False)
+    for panel in axes:
+        panel.set_axis_off()
+    for panel, row in zip(axes, shown, strict=False):
+        product = read_product(product_path(output, row.scan))
+        image = thinned(product.color(0, min(_ROWS, product.shape[0])), 200)
+        show_image(panel, image, (0, image.shape[1], image.shape[0], 0))
+        panel.set_title(row.scan, fontsize=7)
+    caption = f"The first {_ROWS} rows of the first {len(shown)} products of this run."
+    return ReportFigure("thumbnails", "Products", caption, figure)
