@@ -38,43 +38,68 @@ def match_sgbm(
 
     Source: Hirschmüller 2008, Stereo processing by semiglobal matching and mutual information; OpenCV's StereoSGBM.
     """
+    check_pair(left, right, minimum_px, maximum_px)
+    pair = grey_bytes(left), grey_bytes(right)
+    penalties = round(lambda1 * block_size**2), round(lambda2 * block_size**2)
+    matcher = sgbm_matcher(
+        (minimum_px, maximum_px), block_size, penalties, left_right_check_px, uniqueness_percent, speckle_px
+    )
+    return run_sgbm(matcher, *pair, maximum_px)
+
+
+def check_pair(left: Tensor, right: Tensor, minimum_px: int, maximum_px: int) -> None:
+    """Raise ValueError where two strips or a range cannot be matched."""
     if left.shape != right.shape:
         raise ValueError(f"left and right strips must have one shape, got {tuple(left.shape)}, {tuple(right.shape)}")
     if maximum_px <= minimum_px:
         raise ValueError(f"maximum_px must exceed minimum_px, got {minimum_px}..{maximum_px}")
-    count = maximum_px - minimum_px + 1
-    count += -count % _NUM_MULTIPLE
-    matcher = cv2.StereoSGBM.create(
-        minDisparity=minimum_px,
-        numDisparities=count,
+
+
+def sgbm_matcher(
+    range_px: tuple[int, int],
+    block_size: int,
+    penalties: tuple[int, int],
+    left_right_check_px: int,
+    uniqueness_percent: int,
+    speckle_px: int,
+) -> cv2.StereoSGBM:
+    """OpenCV's matcher over a range of disparities, both ends included, made up to the multiple it asks for."""
+    count = range_px[1] - range_px[0] + 1
+    return cv2.StereoSGBM.create(
+        minDisparity=range_px[0],
+        numDisparities=count + -count % _NUM_MULTIPLE,
         blockSize=block_size,
-        P1=round(lambda1 * block_size**2),
-        P2=round(lambda2 * block_size**2),
+        P1=penalties[0],
+        P2=penalties[1],
         disp12MaxDiff=left_right_check_px,
         uniquenessRatio=uniqueness_percent,
         speckleWindowSize=speckle_px,
         speckleRange=1,
         mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY,
     )
+
+
+def run_sgbm(matcher: cv2.StereoSGBM, left: Tensor, right: Tensor, maximum_px: int) -> Float[Tensor, "lines width"]:
+    """Disparity of two grey images, uint8 ``(lines, width)``, over their whole width; NaN where there is no match."""
     # Columns within the range of the image's edge have no partner for some disparities and SGBM leaves them out:
     # a margin of the edge's own value gives them one.
-    before, after = max(minimum_px + count, 0), max(-minimum_px + 1, 0)
-    pair = [_padded(_bytes(image), before, after) for image in (left, right)]
-    steps = torch.from_numpy(matcher.compute(pair[0].numpy(), pair[1].numpy()))[:, before : before + left.shape[1]]
+    minimum_px, width = matcher.getMinDisparity(), left.shape[1]
+    before, after = max(minimum_px + matcher.getNumDisparities(), 0), max(-minimum_px + 1, 0)
+    padded = (cv2.copyMakeBorder(image.numpy(), 0, 0, before, after, cv2.BORDER_REPLICATE) for image in (left, right))
+    steps = torch.from_numpy(matcher.compute(*padded))[:, before : before + width]
     disparity = steps.to(torch.float32) / _SUBPIXEL_STEPS
-    partner = torch.arange(left.shape[1]) - disparity
+    partner = torch.arange(width) - disparity
     in_range = (disparity > minimum_px - 1) & (disparity < maximum_px + 1)
-    seen = in_range & (partner >= 0) & (partner <= left.shape[1] - 1)
+    seen = in_range & (partner >= 0) & (partner <= width - 1)
     return torch.where(seen, disparity, torch.nan)
 
 
-def _bytes(image: Tensor) -> Tensor:
-    values = gray(image)
+def grey_bytes(image: Tensor) -> Tensor:
+    """Brightness ``(lines, width)`` of ``(lines, width, 1 or 3)`` values, uint8; other types over their own range."""
     if image.dtype == torch.uint8:
-        return values.round().to(torch.uint8)
+        if image.shape[-1] == 1:
+            return image[..., 0].contiguous()
+        return torch.from_numpy(cv2.cvtColor(image[..., :3].contiguous().numpy(), cv2.COLOR_RGB2GRAY))
+    values = gray(image)
     low, high = torch.aminmax(values)
     return ((values - low) * (255.0 / max(float(high - low), 1.0))).to(torch.uint8)
-
-
-def _padded(image: Tensor, before: int, after: int) -> Tensor:
-    return torch.nn.functional.pad(image[None].to(torch.float32), (before, after), mode="replicate")[0].to(torch.uint8)

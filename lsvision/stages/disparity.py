@@ -3,42 +3,65 @@
 import math
 from collections import OrderedDict
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
 
 from lsvision.geometry import triangulate
+from lsvision.image.agreement import occluded
 from lsvision.image.checkerboard import gray
-from lsvision.image.matching import match_sgbm
+from lsvision.image.matching import grey_bytes, match_sgbm
+from lsvision.image.pyramid_matching import COARSEST, match_coarse_to_fine
 from lsvision.image.refinement import refine_disparity
 from lsvision.types import LineImage, Rig, Scan
 
 
 @dataclass(frozen=True)
 class DisparityConfig:
-    """Semi-global matching at the paper's settings.
+    """How two images are matched; the default is semi-global matching at the paper's settings.
 
-    The search range is given in heights over the plane of zero disparity, mm, positive towards the cameras: -26.9..25.2
-    is -165..+165 px on the full 3DPIXA and the same 52 mm on any other rig. ``lambda1`` and ``lambda2`` penalise a
-    change of disparity by one and by more, per pixel of the block. ``refine_iterations`` of local least squares over a
-    window of ``refine_window`` px follow; 0 leaves the matcher's own sixteenths of a pixel, which lean towards whole
-    ones. ``strip_lines`` are matched at once, with ``halo_lines`` beyond either end that are thrown away.
+    ``matcher`` is ``sgbm``, one pass over the whole range, or ``coarse_to_fine``, the whole range at a quarter of the
+    size and a few disparities at half of it. The search range is given in heights over the plane of zero disparity, mm,
+    positive towards the cameras: -26.9..25.2 is -165..+165 px on the full 3DPIXA and the same 52 mm on any other rig.
+    ``lambda1`` and ``lambda2`` penalise a change of disparity by one and by more, per pixel of the block.
+    ``left_right_check_px`` is the largest disagreement of the two views, ``fine_check_px`` that of the finer search.
+    ``refine_iterations`` of local least squares over a window of ``refine_window`` px follow; 0 leaves the matcher's
+    own sixteenths of a pixel, which lean towards whole ones. A pixel that is then known no better than
+    ``largest_sigma_px``, though its residual is more than noise, is dropped. ``strip_lines`` are matched at once, with
+    ``halo_lines`` beyond either end that are thrown away.
     """
 
-    matcher: Literal["sgbm"] = "sgbm"
+    matcher: Literal["sgbm", "coarse_to_fine"] = "sgbm"
     height_range_mm: tuple[float, float] = (-26.9, 25.2)
     block_size: int = 5
     lambda1: float = 8.0
     lambda2: float = 32.0
     left_right_check_px: int = 10
+    fine_check_px: int = 4
     uniqueness_percent: int = 5
     speckle_px: int = 100
     refine_iterations: int = 2
     refine_window: int = 9
     refine_noise: float = 2.0  # grey values, of 255
+    largest_sigma_px: float | None = None
     strip_lines: int = 512
     halo_lines: int = 24
+
+
+@dataclass(frozen=True)
+class StripMatch:
+    """Disparity of a strip and its standard deviation, px, ``(lines, width)``; NaN where there is no match.
+
+    Without refinement nothing is known about the deviation: it is NaN everywhere.
+    """
+
+    disparity: Tensor
+    sigma: Tensor
+
+    def occluded(self) -> Tensor:
+        """Which pixels without disparity are hidden from the right camera; the others failed to match."""
+        return occluded(self.disparity)
 
 
 def disparity_range(rig: Rig, config: DisparityConfig) -> tuple[int, int]:
@@ -51,37 +74,63 @@ def disparity_range(rig: Rig, config: DisparityConfig) -> tuple[int, int]:
 
 def match_strip(left: Tensor, right: Tensor, rig: Rig, config: DisparityConfig) -> Tensor:
     """Disparity, px, of a pair of strips ``(lines, width, channels)``; NaN where there is no match."""
-    minimum_px, maximum_px = disparity_range(rig, config)
-    disparity = match_sgbm(
-        left,
-        right,
-        minimum_px=minimum_px,
-        maximum_px=maximum_px,
-        block_size=config.block_size,
-        lambda1=config.lambda1,
-        lambda2=config.lambda2,
-        left_right_check_px=config.left_right_check_px,
-        uniqueness_percent=config.uniqueness_percent,
-        speckle_px=config.speckle_px,
-    )
+    return measure_strip(left, right, rig, config).disparity
+
+
+def measure_strip(left: Tensor, right: Tensor, rig: Rig, config: DisparityConfig) -> StripMatch:
+    """Disparity of a pair of strips ``(lines, width, channels)`` and how well it is known.
+
+    The first line should lie at a multiple of four of the scan's, for the same result whatever the strip.
+    """
+    disparity = _search(left, right, rig, config)
     if config.refine_iterations == 0:
-        return disparity
-    # 16-bit images are brought to the scale on which the noise is given.
-    scale = 1.0 if left.dtype == torch.uint8 else 1.0 / 257.0
-    return refine_disparity(
-        gray(left) * scale,
-        gray(right) * scale,
+        return StripMatch(disparity, torch.full_like(disparity, torch.nan))
+    refined = refine_disparity(
+        _grey(left),
+        _grey(right),
         disparity,
         window=config.refine_window,
         iterations=config.refine_iterations,
         noise=config.refine_noise,
     )
+    if config.largest_sigma_px is None:
+        return StripMatch(refined.disparity, refined.sigma)
+    # On ground without texture little is known, but it is not wrong: there the residual is the sensor's noise.
+    kept = (refined.sigma <= config.largest_sigma_px) | (refined.residual <= 2.0 * config.refine_noise)
+    return StripMatch(*(torch.where(kept, values, torch.nan) for values in (refined.disparity, refined.sigma)))
+
+
+def _search(left: Tensor, right: Tensor, rig: Rig, config: DisparityConfig) -> Tensor:
+    minimum_px, maximum_px = disparity_range(rig, config)
+    options: dict[str, Any] = {
+        "minimum_px": minimum_px,
+        "maximum_px": maximum_px,
+        "block_size": config.block_size,
+        "lambda1": config.lambda1,
+        "lambda2": config.lambda2,
+        "left_right_check_px": config.left_right_check_px,
+        "uniqueness_percent": config.uniqueness_percent,
+        "speckle_px": config.speckle_px,
+    }
+    if config.matcher == "sgbm":
+        return match_sgbm(left, right, **options)
+    return match_coarse_to_fine(left, right, **options, fine_check_px=config.fine_check_px, noise=config.refine_noise)
+
+
+def _grey(image: Tensor) -> Tensor:
+    """Brightness on a scale of 0..255, on which the noise is given."""
+    return grey_bytes(image).to(torch.float32) if image.dtype == torch.uint8 else gray(image) / 257.0
 
 
 def depth_from_disparity(disparity: Tensor, rig: Rig) -> Tensor:
     """Depth z, mm, of a disparity strip ``(lines, width)``, in the strip's dtype; NaN stays NaN."""
     column = torch.arange(disparity.shape[-1], dtype=torch.float64).expand(disparity.shape)
     return triangulate(rig, column, disparity.to(torch.float64))[1].to(disparity.dtype)
+
+
+def depth_sigma(depth: Tensor, sigma: Tensor, rig: Rig) -> Tensor:
+    """Standard deviation of depths, mm, from that of their disparities, px: ``dz/dd = -z² / (f B)``."""
+    return depth.square() * (sigma / (rig.focal_length_px * rig.baseline_mm))
 
 
 @dataclass
@@ -109,11 +158,18 @@ class MatchedDepth:
 
     def read(self, start: int, stop: int) -> Tensor:
         """Depth of lines ``start..stop-1``, ``(stop - start, width, 1)`` in mm."""
+        return self._read(start, stop)[0, :, :, None]
+
+    def read_sigma(self, start: int, stop: int) -> Tensor:
+        """Standard deviation of the depth of lines ``start..stop-1``, ``(stop - start, width, 1)`` in mm."""
+        return self._read(start, stop)[1, :, :, None]
+
+    def _read(self, start: int, stop: int) -> Tensor:
         first = start // self.config.strip_lines
         last = (stop - 1) // self.config.strip_lines
-        depth = torch.cat([self._strip(index) for index in range(first, last + 1)])
+        strips = torch.cat([self._strip(index) for index in range(first, last + 1)], dim=1)
         offset = first * self.config.strip_lines
-        return depth[start - offset : stop - offset, :, None]
+        return strips[:, start - offset : stop - offset]
 
     def _strip(self, index: int) -> Tensor:
         if index not in self._strips:
@@ -124,14 +180,18 @@ class MatchedDepth:
         return self._strips[index]
 
     def _match(self, index: int) -> Tensor:
+        """Depth and its standard deviation, (2, lines, width)."""
         assert self.scan.right is not None
         start = index * self.config.strip_lines
         stop = min(start + self.config.strip_lines, self.scan.lines)
         above, below = max(start - self.config.halo_lines, 0), min(stop + self.config.halo_lines, self.scan.lines)
-        disparity = match_strip(
+        above -= above % COARSEST  # the blocks of the reduced copies are the same in every strip
+        match = measure_strip(
             self.scan.left.read(above, below), self.scan.right.read(above, below), self.scan.rig, self.config
         )
-        return depth_from_disparity(disparity, self.scan.rig)[start - above : stop - above]
+        inner = slice(start - above, stop - above)
+        depth = depth_from_disparity(match.disparity[inner], self.scan.rig)
+        return torch.stack([depth, depth_sigma(depth, match.sigma[inner], self.scan.rig)])
 
 
 def depth_of(scan: Scan, config: DisparityConfig) -> LineImage:

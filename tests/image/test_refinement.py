@@ -14,6 +14,10 @@ INSIDE = (slice(8, -8), slice(24, -24))
 REFINE = {"window": 9, "iterations": 2, "noise": 0.5}
 
 
+def refine(*images, **options):
+    return refine_disparity(*images, **options).disparity
+
+
 def texture(shift: torch.Tensor, noise: float = 0.0) -> torch.Tensor:
     """A sum of waves of 8 to 28 px, seen at u + shift: band-limited, so that its value is known between the pixels."""
     generator = torch.Generator().manual_seed(5)
@@ -31,7 +35,7 @@ def texture(shift: torch.Tensor, noise: float = 0.0) -> torch.Tensor:
 def test_known_shift_is_recovered_without_bias(shift):
     left, right = texture(torch.tensor(0.0), 0.5), texture(torch.tensor(shift), 0.5)
     start = torch.full((LINES, WIDTH), float(round(shift)))
-    error = (refine_disparity(left, right, start, **REFINE) - shift)[INSIDE]
+    error = (refine(left, right, start, **REFINE) - shift)[INSIDE]
     assert error.square().mean().sqrt() < 0.05
     assert abs(error.mean()) < 0.005
 
@@ -44,7 +48,7 @@ def test_pixel_locking_of_the_matcher_is_removed():
     left = texture(-truth, 0.5)  # left sees at u what right sees at u - d
     pair = [image.clamp(0, 255).round().to(torch.uint8)[..., None] for image in (left, right)]
     matched = match_sgbm(*pair, minimum_px=-8, maximum_px=12, **OPTIONS)
-    refined = refine_disparity(left, right, matched, **REFINE)
+    refined = refine(left, right, matched, **REFINE)
 
     def error_by_phase(disparity):
         """Bias by the fraction of the true disparity, in eight bins."""
@@ -64,10 +68,10 @@ def test_pixel_locking_of_the_matcher_is_removed():
 def test_untextured_ground_stays():
     start = 3.0 + 0.01 * torch.arange(WIDTH).float().expand(LINES, WIDTH)
     left, right = (100 + 0.5 * torch.randn(LINES, WIDTH) for _ in "ab")
-    refined = refine_disparity(left, right, start, **REFINE)
+    refined = refine(left, right, start, **REFINE)
     assert (refined - start)[INSIDE].abs().mean() < 0.25  # as little as matching itself knows
     flat = torch.full((LINES, WIDTH), 100.0)
-    torch.testing.assert_close(refine_disparity(flat, flat, start, **REFINE)[INSIDE], start[INSIDE])
+    torch.testing.assert_close(refine(flat, flat, start, **REFINE)[INSIDE], start[INSIDE])
 
 
 def test_missing_stays_missing_and_pulls_nothing():
@@ -75,25 +79,25 @@ def test_missing_stays_missing_and_pulls_nothing():
     left, right = texture(torch.tensor(0.0)), texture(torch.tensor(shift))
     start = torch.full((LINES, WIDTH), 2.0)
     start[20:40, 100:140] = torch.nan
-    refined = refine_disparity(left, right, start, **REFINE)
+    refined = refine(left, right, start, **REFINE)
     assert torch.equal(refined.isnan(), start.isnan())
     assert (refined - shift)[INSIDE].abs().nan_to_num().mean() < 0.01
     around = (slice(12, 48), slice(92, 148))
     assert (refined - shift)[around].abs().nan_to_num().max() < 0.1
-    assert refine_disparity(left, right, torch.full_like(start, torch.nan), **REFINE).isnan().all()
+    assert refine(left, right, torch.full_like(start, torch.nan), **REFINE).isnan().all()
 
 
 def test_brightness_offset_changes_nothing():
     left, right = texture(torch.tensor(0.0)), texture(torch.tensor(1.3))
     start = torch.ones(LINES, WIDTH)
-    refined = refine_disparity(left, right, start, **REFINE)
-    torch.testing.assert_close(refine_disparity(left + 30, right - 20, start, **REFINE), refined, rtol=0, atol=1e-3)
+    refined = refine(left, right, start, **REFINE)
+    torch.testing.assert_close(refine(left + 30, right - 20, start, **REFINE), refined, rtol=0, atol=1e-3)
 
 
 def test_a_large_change_is_undone():
     left, right = texture(torch.tensor(0.0)), texture(torch.tensor(0.9))
     start = torch.zeros(LINES, WIDTH)
-    refined = refine_disparity(left, right, start, window=9, iterations=4, noise=1.0, largest_change_px=0.3)
+    refined = refine(left, right, start, window=9, iterations=4, noise=1.0, largest_change_px=0.3)
     assert (refined[INSIDE] == 0).float().mean() > 0.95
 
 

@@ -1,0 +1,139 @@
+"""Dense stereo matching from coarse to fine: the whole range on a small copy, a few disparities on a larger one.
+
+A quarter of the size holds a sixteenth of the pixels and a quarter of the disparities. What it finds is wrong by a
+pixel of its own here and there, and by a few beside an edge, where blocks see two surfaces. So around each pixel the
+nearest and the farthest surface are both tried at half the size, and the one that fits better stays. What is left to
+find, fractions of a pixel, is the work of ``refine_disparity``.
+"""
+
+import math
+
+import cv2
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from lsvision.image.agreement import agreeing, fill_from_background
+from lsvision.image.matching import check_pair, grey_bytes, run_sgbm, sgbm_matcher
+from lsvision.image.refinement import refine_disparity
+
+COARSEST = 4  # size of the full image over that of the smallest copy; strips should start at multiples of it
+_AROUND = (-8, 7)  # disparities tried around the coarse one, px of half the size
+# Surfaces that differ by less over a neighbourhood of the small copy, px of it, are within reach of one search.
+_TWO_SURFACES_PX = 5.0
+_NEIGHBOURHOOD = 5
+_SMOOTH_PX = 2.0  # a larger step between neighbours is an edge, over which nothing is interpolated
+_COARSE_SPECKLE = 2  # times the pixels of a speckle: what is removed here is found again at half the size
+_COST_BLOCK, _COST_LIMIT, _NO_MATCH = 5, 60, 255.0
+
+
+def match_coarse_to_fine(
+    left: Tensor,
+    right: Tensor,
+    *,
+    minimum_px: int,
+    maximum_px: int,
+    block_size: int,
+    lambda1: float,
+    lambda2: float,
+    left_right_check_px: int,
+    fine_check_px: int,
+    uniqueness_percent: int,
+    speckle_px: int,
+    noise: float,
+) -> Float[Tensor, "lines width"]:
+    """Disparity u_left - u_right of a pair of strips, good to a tenth of a pixel; float32 px, NaN for no match.
+
+    Args:
+        left, right: as in ``match_sgbm``, as are the range, the block, the penalties and the shares.
+        left_right_check_px: largest disagreement of the two views on the small copy, in full pixels.
+        fine_check_px: largest disagreement at half the size, in full pixels.
+        speckle_px: smaller patches are removed, in pixels of half the size.
+        noise: standard deviation of the grey values, of 255.
+
+    Raises:
+        ValueError: shapes differ or the range is empty.
+
+    Source: Hirschmüller 2008, as ``match_sgbm``, over a pyramid as in Rothermel et al. 2012, SURE.
+    """
+    check_pair(left, right, minimum_px, maximum_px)
+    penalties = round(lambda1 * block_size**2), round(lambda2 * block_size**2)
+    lines, width, _ = left.shape
+    (half_left, left_4), (half_right, right_4) = (_reduced(grey_bytes(image)) for image in (left, right))
+    low, high = math.floor(minimum_px / COARSEST), math.ceil(maximum_px / COARSEST)
+    check = round(left_right_check_px / COARSEST)
+    speckle = _COARSE_SPECKLE * speckle_px
+    matcher = sgbm_matcher((low, high), block_size, penalties, check, uniqueness_percent, speckle)
+    coarse = fill_from_background(run_sgbm(matcher, left_4, right_4, high))
+    if coarse is None:
+        return left.new_full((lines, width), torch.nan, dtype=torch.float32)
+    check = round(fine_check_px / 2)
+    matcher = sgbm_matcher(_AROUND, block_size, penalties, check, uniqueness_percent, 0)
+    found = (_match_around(matcher, half_left, half_right, base) for base in _surfaces(coarse))
+    (near, near_cost), (far, far_cost) = found
+    disparity = _without_speckles(torch.where(near_cost <= far_cost, near, far), speckle_px)
+    disparity = agreeing(disparity, torch.minimum(near_cost, far_cost), check)
+    grey_left, grey_right = half_left.to(torch.float32), half_right.to(torch.float32)
+    disparity = refine_disparity(grey_left, grey_right, disparity, window=9, iterations=1, noise=noise).disparity
+    full = _enlarged(2 * disparity, (2 * half_left.shape[0], 2 * half_left.shape[1]))[:lines, :width]
+    partner = torch.arange(width) - full
+    inside = (partner >= 0) & (partner <= width - 1) & (full > minimum_px - 1) & (full < maximum_px + 1)
+    return torch.where(inside, full, torch.nan)
+
+
+def _reduced(image: Tensor) -> tuple[Tensor, Tensor]:
+    """Copies of half and of a quarter of the size, by averages; an incomplete last block repeats the edge."""
+    lines, width = image.shape
+    whole = cv2.copyMakeBorder(image.numpy(), 0, -lines % COARSEST, 0, -width % COARSEST, cv2.BORDER_REPLICATE)
+    copies = (cv2.resize(whole, None, fx=1 / k, fy=1 / k, interpolation=cv2.INTER_AREA) for k in (2, COARSEST))
+    half, quarter = (torch.from_numpy(copy) for copy in copies)
+    return half, quarter
+
+
+def _surfaces(coarse: Tensor) -> tuple[Tensor, Tensor]:
+    """The nearest and the farthest surface around each pixel at half the size, one where they are within reach."""
+    middle = cv2.medianBlur(coarse.numpy(), 5)
+    kernel = cv2.getStructuringElement(cv2.MORPH_RECT, (_NEIGHBOURHOOD, _NEIGHBOURHOOD))
+    near, far, middle = (torch.from_numpy(x) for x in (cv2.dilate(middle, kernel), cv2.erode(middle, kernel), middle))
+    one = near - far < _TWO_SURFACES_PX
+    size = 2 * coarse.shape[0], 2 * coarse.shape[1]
+    near, far = (_enlarged(2 * torch.where(one, middle, surface), size) for surface in (near, far))
+    return near, far
+
+
+def _match_around(matcher: cv2.StereoSGBM, left: Tensor, right: Tensor, base: Tensor) -> tuple[Tensor, Tensor]:
+    """Disparity by a search around a base, and how badly it fits: the mean absolute difference over a block."""
+    disparity = base + run_sgbm(matcher, left, _warped(right, base), _AROUND[1])
+    partner = torch.arange(left.shape[1]) - disparity
+    disparity = torch.where((partner > -0.5) & (partner < left.shape[1] - 0.5), disparity, torch.nan)
+    difference = cv2.absdiff(_warped(right, torch.nan_to_num(disparity)).numpy(), left.numpy())
+    cost = torch.from_numpy(cv2.blur(difference.clip(max=_COST_LIMIT), (_COST_BLOCK, _COST_BLOCK))).to(torch.float32)
+    return disparity, torch.where(disparity.isnan(), _NO_MATCH, cost)
+
+
+def _warped(image: Tensor, disparity: Tensor) -> Tensor:
+    lines, width = disparity.shape
+    column = torch.arange(width, dtype=torch.float32) - disparity
+    line = torch.arange(lines, dtype=torch.float32)[:, None].expand(lines, width).contiguous()
+    warped = cv2.remap(image.numpy(), column.numpy(), line.numpy(), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return torch.from_numpy(warped)
+
+
+def _without_speckles(disparity: Tensor, size: int) -> Tensor:
+    """Disparity without patches of fewer pixels than ``size``, set apart by steps of more than a pixel."""
+    steps, missing = 16, -32768
+    scaled = torch.nan_to_num(steps * disparity, nan=missing).clamp(missing, -missing - 1).to(torch.int16)
+    cv2.filterSpeckles(scaled.numpy(), missing, size, steps)
+    return torch.where(scaled == missing, torch.nan, disparity)
+
+
+def _enlarged(disparity: Tensor, size: tuple[int, int]) -> Tensor:
+    """Interpolated between pixels of one surface, taken from the nearest beside an edge; NaN stays NaN."""
+    shape = size[1], size[0]
+    nearest = torch.from_numpy(cv2.resize(disparity.numpy(), shape, interpolation=cv2.INTER_NEAREST))
+    filled = fill_from_background(disparity)
+    if filled is None:
+        return nearest
+    smooth = torch.from_numpy(cv2.resize(filled.numpy(), shape, interpolation=cv2.INTER_LINEAR))
+    # A comparison with NaN is false: what is missing stays.
+    return torch.where((smooth - nearest).abs() < _SMOOTH_PX, smooth, nearest)
