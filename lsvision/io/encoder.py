@@ -18,6 +18,10 @@ from lsvision.io.validation import read_text
 
 HEADER = ["line", "position_mm"]
 
+# A gap over which the object moved by less than this part of its usual advance was a halt, not a few lost readings.
+_STANDSTILL = 0.5
+_CLOSE = 1e-6  # part of the way to the next good reading that lines of a halt are spread over
+
 logger = logging.getLogger(__name__)
 
 
@@ -92,13 +96,25 @@ def _listed(lines: NDArray[np.int64]) -> str:
 
 
 def _repaired(path: Path, line: NDArray[np.int64], position: NDArray[np.float64], lines: int) -> NDArray[np.float64]:
-    """Positions with every line outside the longest increasing run of readings interpolated."""
+    """Positions with every line outside the longest increasing run of readings interpolated.
+
+    Where the object stood or went back, the lines in between saw it again where it had been already: they are put
+    close together behind the last good reading, so that no part of the object is taken from them.
+    """
     first = np.append(True, line[1:] != line[:-1])
     line, position = line[first], position[first]
     good = _longest_increasing(position)
+    step = np.diff(position[good], prepend=-np.inf)
+    good = good[step > _CLOSE * np.median(step[1:])] if len(good) > 1 else good  # rounding is no progress
     if line[good[0]] != 0 or line[good[-1]] != lines - 1:
         raise FileFormatError(path, "cannot be repaired: the first or the last line has no good reading")
-    return np.interp(np.arange(lines), line[good], position[good])
+    line, position = line[good], position[good]
+    elapsed, advance = np.diff(line), np.diff(position)
+    stood = (elapsed > 1) & (advance < _STANDSTILL * np.median(advance / elapsed) * elapsed)
+    knots = np.append(line, line[1:][stood] - 1)
+    values = np.append(position, position[:-1][stood] + _CLOSE * advance[stood])
+    order = np.argsort(knots)
+    return np.interp(np.arange(lines), knots[order], values[order])
 
 
 def _longest_increasing(values: NDArray[np.float64]) -> NDArray[np.int64]:

@@ -21,6 +21,9 @@ from lsvision.stages.profiles import ProfileReader, ProfileRule
 from lsvision.stages.uncertainty import position_sigma
 from lsvision.types import LineImage, Motion, Scan
 
+# Lines missing between two from which on nothing counts as measured there; a camera that runs free misses a few.
+_MISSED_LINES = 3
+
 
 @dataclass(frozen=True)
 class ProductStrip:
@@ -197,20 +200,28 @@ def _locate(correction: _Correction, lines: _Lines, row: int, rows: slice, colum
     position = (along.flip(0) if backwards else along) - offset
     # Whole rows and lines are taken off and put on without rounding: no bit of a row depends on the strip it lies in.
     position = (position - grid.origin_y_mm) / grid.pitch_mm - first_row
+    missed = _missed_lines(correction, along.flip(0) if backwards else along)
     connected = q_z.diff(dim=1).abs() <= correction.largest_step_mm  # false beside a hole
+    connected &= missed <= correction.config.bridge_px
     segment, fraction = visible_segments(position, q_z, connected, rows.stop - rows.start)
 
     def seen(values: Tensor) -> Tensor:
         return interpolate_segments(values, segment, fraction).mT.contiguous()
 
+    measured = both_ends(by_column(profiles.measured), segment) & (missed <= _MISSED_LINES)[segment.clamp(min=0)]
     line = ((stop - 1) - segment) - fraction if backwards else (start + segment) + fraction
     return _Seen(
         line=torch.where(segment >= 0, line, torch.nan).mT.contiguous(),
         column=seen(by_column(profiles.column)),
         q_z=seen(q_z),
-        measured=both_ends(by_column(profiles.measured), segment).mT.contiguous(),
+        measured=measured.mT.contiguous(),
         sigma=None if profiles.sigma is None else seen(by_column(profiles.sigma)),
     )
+
+
+def _missed_lines(correction: _Correction, along: Tensor) -> Tensor:
+    """Lines that would have fitted between each two, by how far the object moved on."""
+    return along.diff() / (correction.motion.stretch * correction.scan.travel.line_pitch_mm) - 1
 
 
 def _spacing(correction: _Correction) -> tuple[float, float]:
