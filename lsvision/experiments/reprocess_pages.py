@@ -58,10 +58,11 @@ def _thumbnails(made: Sequence[ScanRow], output: Path) -> ReportFigure:
     figure, axes = new_figure(1.9 * across, 2.1 * down, down, across, squeeze=False)
     for panel in axes:
         panel.set_axis_off()
-    for panel, row in zip(axes, shown, strict=False):
+    for number, (panel, row) in enumerate(zip(axes, shown, strict=False), start=1):
         product = read_product(product_path(output, row.scan))
         image = thinned(product.color(0, min(_ROWS, product.shape[0])), 200)
         show_image(panel, image, (0, image.shape[1], image.shape[0], 0))
-        panel.set_title(row.scan, fontsize=7)
-    caption = f"The first {_ROWS} rows of the first {len(shown)} products of this run."
+        panel.set_title(str(number), fontsize=7)  # no font has the letters of every name
+    names = ", ".join(f"{number} {row.scan}" for number, row in enumerate(shown, start=1))
+    caption = f"The first {_ROWS} rows of products of this run: {names}."
     return ReportFigure("thumbnails", "Products", caption, figure)
