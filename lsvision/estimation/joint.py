@@ -138,22 +138,19 @@ def iterated_update(
     failed, path, iterations = ~running, [mean], torch.zeros_like(running, dtype=torch.long)
     for _ in range(max_iterations):
         target, new_factor, root = _solve(rows, mean, prior_mean, prior_root)
-        new_mean, new_rows = _damped(linearise, rows, mean, target, new_factor, prior_mean, prior_root)
         divergence = _divergence(target - mean, root, factor)
-        ok = torch.isfinite(divergence) & torch.isfinite(new_mean).all(-1)
+        ok = torch.isfinite(divergence) & torch.isfinite(target).all(-1)
         failed = failed | (running & ~ok)
-        moved = running & ok
-        mean = torch.where(moved[..., None], new_mean, mean)
+        moved, running = running & ok, running & ok & (divergence > tolerance)
         factor = torch.where(moved[..., None, None], new_factor, factor)
-        rows = Rows(
-            torch.where(moved[..., None, None], new_rows.matrix, rows.matrix),
-            torch.where(moved, new_rows.log_det, rows.log_det),
-        )
         iterations = iterations + moved
-        path.append(mean)
-        running = moved & (divergence > tolerance)
-        if not bool(running.any()):
+        if not bool(running.any()):  # nothing is linearised about a last step
+            mean = torch.where(moved[..., None], target, mean)
+            path.append(mean)
             break
+        new_mean, rows = _damped(linearise, rows, mean, target, new_factor, running, prior_mean, prior_root)
+        mean = torch.where(moved[..., None], new_mean, mean)
+        path.append(mean)
     info = torch.where(failed, int(Info.SINGULAR), torch.where(running, int(Info.NOT_CONVERGED), int(Info.OK)))
     return Posterior(mean, factor, torch.stack(path), iterations, ~failed & ~running, info)
 
@@ -182,16 +179,20 @@ def _damped(
     mean: Tensor,
     target: Tensor,
     factor: Tensor,
+    running: Tensor,
     prior_mean: Tensor,
     prior_root: Tensor,
 ) -> tuple[Tensor, Rows]:
-    """As far towards ``target`` as the cost does not rise, and the rows there; mostly the full step."""
+    """As far towards ``target`` as the cost does not rise, and the rows there; mostly the full step.
+
+    Problems that are not running any more take the full step: it is too short to overshoot.
+    """
     ceiling = _cost(rows, mean, prior_mean, prior_root) + _COST_SLACK
     step = torch.ones_like(ceiling)
     for _ in range(_HALVINGS):
         candidate = mean + step[..., None] * (target - mean)
         new_rows = linearise(candidate, factor)
-        high = _cost(new_rows, candidate, prior_mean, prior_root) > ceiling
+        high = running & (_cost(new_rows, candidate, prior_mean, prior_root) > ceiling)
         if not bool(high.any()):
             break
         step = torch.where(high, step / 2, step)

@@ -14,8 +14,9 @@ _LINE = 8  # float64 values of a cache line
 
 def upper_root(matrix: Float[Tensor, "*batch rows columns"]) -> Float[Tensor, "*batch least columns"]:
     """R of the QR decomposition, Rᵀ R = matrixᵀ matrix, of as many rows as the smaller dimension; signs are free."""
-    least = min(matrix.shape[-2:])
-    return torch.linalg.qr(pad(matrix, (0, 0, 0, -matrix.shape[-2] % _LINE)), mode="r").R[..., :least, :]
+    least, more = min(matrix.shape[-2:]), -matrix.shape[-2] % _LINE
+    padded = pad(matrix, (0, 0, 0, more)) if more else matrix  # padding by nothing is a copy
+    return torch.linalg.qr(padded, mode="r").R[..., :least, :]
 
 
 def lower_factor(factor: Float[Tensor, "*batch state columns"]) -> Float[Tensor, "*batch state state"]:

@@ -6,7 +6,9 @@ the centroid) has the residual
 
     e = (x, 0, z) + y n - (exp(θ) R0 p + t),      Cov e = M Σ Mᵀ,   M = [e_x | n | e_z].
 
-It is linear in t and n, and only θ needs cubature points. M⁻¹ is ``scan_position``: it turns a displacement of the
+It is linear in t and n, and only θ needs cubature points. All corners of a board are predicted by one affine map of
+their board points: a board's measurements are reduced once, exactly, to thirteen rows on the map's twelve coefficients,
+and a linearisation costs the same for any number of corners. M⁻¹ is ``scan_position``: it turns a displacement of the
 object into one of the measurement. The derivative by n is the predicted travel, not the measured: the noise of y,
 multiplied by an n that the board cannot show, would pass for knowledge of it.
 
@@ -14,16 +16,20 @@ Source: Wang et al. 2024, Eq. 10-18; M generalises its R + σ_y² n nᵀ to nois
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from lsvision.estimation import Rows, apply, lower_factor, slr, upper_root, whitened_rows
+from lsvision.estimation import Rows, apply, lower_factor, slr, upper_root
+from lsvision.estimation.square_root import forward_substitute
 from lsvision.geometry import displace, fit_rigid, rotation_from_vector, scan_position, transform
 
 # Spread, rad and mm, of cubature points that stand for one point: the model there is its tangent to ten digits.
 POINT_SPREAD = 1e-6
+
+_LATENTS = 3  # of the error of a board's linearised rotation
 
 
 @dataclass(frozen=True)
@@ -54,6 +60,32 @@ class BoardProblem:
     def boards(self) -> int:
         """Number of boards, B; the state has 6 B + 3 components."""
         return self.points.shape[-3]
+
+    @cached_property
+    def affine_rows(self) -> Float[Tensor, "*batch boards 13 13"]:
+        """Whitened rows ``[S | q]`` of the affine map (1, p) -> measured: all that a board's corners say.
+
+        For a map c, its three values at 1, then those at each component of p, ‖q - S c‖² is the squared whitened error
+        of all valid corners.
+        """
+        eye = torch.eye(3, dtype=self.points.dtype, device=self.points.device)
+        right = torch.cat([eye.expand(*self.points.shape, 3), self.points[..., None]], dim=-1)
+        right = torch.where(self.valid[..., None, None], right, 0.0)
+        # Whitener and whitened points as (*batch, boards, column, row, corner): corners side by side in memory.
+        whitened = forward_substitute(*(m.movedim((-2, -1), (0, 1)).contiguous() for m in (self.noise_chol, right)))
+        whitened = whitened.movedim((1, 0), (-3, -2))
+        columns = self.points.new_empty(*whitened.shape[:-3], 13, *whitened.shape[-2:])
+        columns[..., :3, :, :], columns[..., 12, :, :] = whitened[..., :3, :, :], whitened[..., 3, :, :]
+        for k, component in enumerate(self.body_points.unbind(-1)):
+            by_point = columns[..., 3 + 3 * k : 6 + 3 * k, :, :]
+            torch.mul(whitened[..., :3, :, :], component[..., None, None, :], out=by_point)
+        return upper_root(columns.flatten(-2).mT)
+
+    @cached_property
+    def noise_log_det(self) -> Float[Tensor, "*batch"]:
+        """Log-determinant of the covariance of all valid corners' points."""
+        by_corner = self.noise_chol.diagonal(dim1=-2, dim2=-1).log().sum(-1)
+        return 2 * torch.where(self.valid, by_corner, 0.0).sum((-2, -1))
 
 
 def nominal_problem(
@@ -116,14 +148,13 @@ def linearise(
 
     The linearisation's errors of different boards are taken as independent.
     """
-    A, error, residual = _measured_model(problem, mean, factor)
-    rows = whitened_rows(A, residual, error, problem.noise_chol, problem.valid)
-    n = mean[..., -3:]
-    by_motion = 2 * problem.valid.sum((-2, -1)) * n[..., 1].abs().log()
-    joined = _scatter(rows.matrix)
+    rows = upper_root(_affine_model(problem, mean, factor))
+    by_latents = rows[..., :_LATENTS, :_LATENTS].diagonal(dim1=-2, dim2=-1).abs().log().sum((-2, -1))
+    by_motion = problem.valid.sum((-2, -1)) * mean[..., -2].abs().log()
+    joined = _scatter(rows[..., _LATENTS:, _LATENTS:])
     if problem.pitch is not None:
         joined = torch.cat([joined, _pitch_row(problem, problem.pitch, mean, factor)], dim=-2)
-    return Rows(joined, rows.log_det.sum(-1) + by_motion)
+    return Rows(joined, problem.noise_log_det + 2 * (by_latents + by_motion))
 
 
 def corner_rows(
@@ -158,6 +189,38 @@ def translations(problem: BoardProblem, state: Float[Tensor, "*batch state"]) ->
     """Translations T of the boards, mm: where the board frames' origins lie."""
     position = split_state(state)[1]
     return position - apply(rotations(problem, state), problem.centroid)
+
+
+def _affine_model(problem: BoardProblem, mean: Tensor, factor: Tensor) -> Tensor:
+    """All corners' whitened rows, ``(*batch, boards, 16, 13)``, the unit prior of the latents below them.
+
+    The columns are three latents of the linearisation's error, the board's nine unknowns and the residual. The map from
+    board points to measured ones is linear in its columns t, R e_x, R e_y, R e_z, each taken through M⁻¹.
+    """
+    theta, position, n = split_state(mean)
+    A, b, error = slr(lambda vector: _rotation_columns(problem, vector), theta, _theta_chol(problem, factor))
+    turned = (apply(A, theta) + b).unflatten(-1, (3, 3))
+    by_theta = torch.cat([error, A], dim=-1).unflatten(-2, (3, 3))
+    placed = torch.cat([position[..., None, :], turned], dim=-2)
+    travel = placed[..., 1] / n[..., None, None, 1]
+
+    moves = mean.new_zeros(*placed.shape, _LATENTS + 9)
+    moves[..., 1:, :, :6] = by_theta
+    moves[..., 0, :, 6:9] = torch.eye(3, dtype=mean.dtype, device=mean.device)
+    moves[..., 9:] = -travel[..., None, None] * torch.eye(3, dtype=mean.dtype, device=mean.device)
+    columns = torch.cat([moves, placed[..., None]], dim=-1)
+    columns = scan_position(columns.mT, n[..., None, None, None, :]).mT.flatten(-3, -2)
+    # A sum, not a matrix product: the last bits of that depend on the batch.
+    root = problem.affine_rows
+    rows = (root[..., :-1, None] * columns[..., None, :, :]).sum(-2)
+    rows[..., -1] = root[..., -1] - rows[..., -1]
+    unit = torch.eye(_LATENTS, _LATENTS + 10, dtype=mean.dtype, device=mean.device)
+    return torch.cat([rows, unit.expand(*rows.shape[:-2], -1, -1)], dim=-2)
+
+
+def _rotation_columns(problem: BoardProblem, theta: Tensor) -> Tensor:
+    """R e_x, R e_y and R e_z, one after the other, ``(points, *batch, boards, 9)``, at cubature points of theta."""
+    return (rotation_from_vector(theta) @ problem.rotation).mT.flatten(-2)
 
 
 def _turned(problem: BoardProblem, theta: Tensor) -> Tensor:

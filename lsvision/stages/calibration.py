@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import reduce
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -199,16 +200,15 @@ def _sound_problem(
     points: Tensor, covariance: Tensor, board_points: Tensor, valid: Tensor, pitch: MountingPitch | None
 ) -> tuple[BoardProblem, Tensor, Tensor]:
     """The problem, its start, and which of the batch are sound; the others are replaced by a harmless stand-in."""
-    covariance, board_points = covariance.expand(*points.shape, 3), board_points.expand(points.shape)
-    valid = valid.expand(points.shape[:-1])
-    sound = ~torch.stack(list(_flaws(points, covariance, board_points, valid).values())).any(0).any(-1)
+    sound = ~reduce(torch.logical_or, _flaws(points, covariance, board_points, valid).values()).any(-1)
     keep, seen = sound[..., None, None], valid & sound[..., None, None]
     index = torch.arange(points.shape[-2], dtype=points.dtype, device=points.device)
     stand_in = torch.stack([index, index * index, torch.zeros_like(index)], dim=-1)
     eye = torch.eye(3, dtype=points.dtype, device=points.device)
     points = torch.where(seen[..., None], points, torch.where(keep[..., None], 0.0, stand_in))
     board_points = torch.where(seen[..., None], board_points, torch.where(keep[..., None], 0.0, stand_in))
-    chol = torch.linalg.cholesky(torch.where(seen[..., None, None], covariance, eye))
+    # Factored as few times as it was given: boards of one batch mostly share their noise.
+    chol = torch.where(seen[..., None, None], torch.linalg.cholesky_ex(covariance).L, eye)
     problem, start = nominal_problem(points, chol, board_points, seen | ~keep, pitch)
     return problem, start, sound
 
@@ -219,7 +219,8 @@ def _noise_scale(problem: BoardProblem, posterior: Posterior) -> Tensor:
     They are weighed with the linearisation's error as well: where n is known from its prior alone, the mean of the
     posterior does not lie on the curve of poses and n that fit.
     """
-    rows = linearise(replace(problem, pitch=None), posterior.mean, posterior.factor)
+    corners_alone = problem if problem.pitch is None else replace(problem, pitch=None)
+    rows = linearise(corners_alone, posterior.mean, posterior.factor)
     squared = rows.matrix[..., -1].square().sum(-1)
     freedom = 3.0 * problem.valid.sum((-2, -1)) - posterior.mean.shape[-1]
     unlikely = torch.special.gammaincc(freedom / 2, squared / 2) < _NOISE_TEST_LEVEL
