@@ -23,7 +23,7 @@ from lsvision.io import (
 from lsvision.report import product_report
 from lsvision.stages.correction import CorrectionConfig, ProductGrid, correct_scan, plan_product
 from lsvision.stages.disparity import DisparityConfig, depth_of
-from lsvision.stages.uncertainty import drift_per_metre
+from lsvision.stages.uncertainty import drift_per_metre, sigma_of
 from lsvision.types import Motion, Scan
 
 log = logging.getLogger(__name__)
@@ -99,12 +99,12 @@ def write_product(
 ) -> ProductSummary:
     """Stream a scan through disparity and correction into a product on disk."""
     keep_freed_memory()
-    grid = plan_product(scan, motion, correction)
+    depth, grid = depth_of(scan, disparity), plan_product(scan, motion, correction)
     layout = product_layout(scan, motion, correction, grid, metadata or {})
     bar = bars.start(f"correct {target.stem}", total=grid.rows)
     valid, low, high = 0, float("inf"), float("-inf")
     with ProductWriter(target, layout) as writer:
-        for strip in correct_scan(scan, depth_of(scan, disparity), motion, correction, grid):
+        for strip in correct_scan(scan, depth, motion, correction, grid, sigma_of(depth)):
             writer.write(strip.row, strip.color, strip.height, strip.valid, strip.source, strip.sigma)
             bars.advance(bar, strip.color.shape[0])
             if bool(strip.valid.any()):

@@ -99,7 +99,7 @@ def _repaired(path: Path, line: NDArray[np.int64], position: NDArray[np.float64]
     """Positions with every line outside the longest increasing run of readings interpolated.
 
     Where the object stood or went back, the lines in between saw it again where it had been already: they are put
-    close together behind the last good reading, so that no part of the object is taken from them.
+    close together beside a good reading, so that no part of the object is taken from them.
     """
     first = np.append(True, line[1:] != line[:-1])
     line, position = line[first], position[first]
@@ -108,11 +108,14 @@ def _repaired(path: Path, line: NDArray[np.int64], position: NDArray[np.float64]
     good = good[step > _CLOSE * np.median(step[1:])] if len(good) > 1 else good  # rounding is no progress
     if line[good[0]] != 0 or line[good[-1]] != lines - 1:
         raise FileFormatError(path, "cannot be repaired: the first or the last line has no good reading")
-    line, position = line[good], position[good]
-    elapsed, advance = np.diff(line), np.diff(position)
+    elapsed, advance = np.diff(line[good]), np.diff(position[good])
     stood = (elapsed > 1) & (advance < _STANDSTILL * np.median(advance / elapsed) * elapsed)
-    knots = np.append(line, line[1:][stood] - 1)
-    values = np.append(position, position[:-1][stood] + _CLOSE * advance[stood])
+    before, after, advance = good[:-1][stood], good[1:][stood], advance[stood]
+    # Beside the good reading that the object was nearer to when it came to the other.
+    early = np.abs(position[after - 1] - position[before]) <= np.abs(position[before + 1] - position[after])
+    knots = np.where(early, line[after] - 1, line[before] + 1)
+    values = np.where(early, position[before] + _CLOSE * advance, position[after] - _CLOSE * advance)
+    knots, values = np.append(line[good], knots), np.append(position[good], values)
     order = np.argsort(knots)
     return np.interp(np.arange(lines), knots[order], values[order])
 

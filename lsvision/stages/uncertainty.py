@@ -1,11 +1,42 @@
 """How well a product's positions are known: from the matching, and from what the calibration leaves open."""
 
+from dataclasses import dataclass
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from lsvision.geometry import product_axes, travel_at
-from lsvision.types import Motion, Scan
+from lsvision.stages.disparity import MatchedDepth
+from lsvision.types import LineImage, Motion, Scan
+
+
+@dataclass(frozen=True)
+class MatchedSigma:
+    """The standard deviation of a matched depth map, mm, as a ``LineImage``."""
+
+    depth: MatchedDepth
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """(lines, width, 1)."""
+        return self.depth.shape
+
+    @property
+    def dtype(self) -> torch.dtype:
+        """float32."""
+        return self.depth.dtype
+
+    def read(self, start: int, stop: int) -> Tensor:
+        """Lines ``start..stop-1``."""
+        return self.depth.read_sigma(start, stop)
+
+
+def sigma_of(depth: LineImage) -> LineImage | None:
+    """The standard deviation of a depth map where its matcher tells it."""
+    if isinstance(depth, MatchedDepth) and depth.config.refine_iterations > 0:
+        return MatchedSigma(depth)
+    return None
 
 
 def position_sigma(

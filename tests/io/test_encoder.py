@@ -99,16 +99,17 @@ def test_longest_increasing_subsequence_against_all_subsequences(values: list[fl
 
 
 def test_nothing_is_taken_from_the_lines_of_a_halt_or_a_way_back(tmp_path: Path) -> None:
-    ahead = np.arange(50) * 0.07
+    step = 0.0625  # exact in binary: equal places have equal readings
+    ahead = np.arange(50) * step
     halt = np.full(30, ahead[-1])
-    back = ahead[-1] - np.arange(1, 21) * 0.07
-    again = back[-1] + np.arange(1, 61) * 0.07
+    back = ahead[-1] - np.arange(1, 21) * step
+    again = back[-1] + np.arange(1, 61) * step
     true = np.concatenate([ahead, halt, back, again])
     repaired = read_encoder(log(tmp_path, list(enumerate(true.tolist()))), len(true), repair=True).numpy()
     advance = np.diff(repaired)
     assert (advance > 0).all()
     # Lines between which anything of the object is taken lie where they truly were, to within a line.
     used = advance > 1e-5
-    assert used.sum() == pytest.approx((repaired[-1] - repaired[0]) / 0.07, abs=1)
-    assert np.abs(repaired - true)[:-1][used].max() < 0.07 + 1e-6
-    assert np.abs(repaired - true)[1:][used].max() < 0.07 + 1e-6
+    assert used.sum() == pytest.approx((repaired[-1] - repaired[0]) / step, abs=1)
+    assert np.abs(repaired - true)[:-1][used].max() < step + 1e-6
+    assert np.abs(repaired - true)[1:][used].max() < step + 1e-6
