@@ -36,13 +36,13 @@ def key_of(*values: Any) -> str:
     return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()
 
 
-def disparity_key(input_sha256: str, config: DisparityConfig, repair_encoder: bool, version: str) -> str:
+def disparity_key(input_sha256: str, config: DisparityConfig, with_sigma: bool, version: str) -> str:
     """What the depth of a scan's lines depends on."""
-    return key_of(input_sha256, asdict(config), repair_encoder, version)
+    return key_of(input_sha256, asdict(config), with_sigma, version)
 
 
-def product_key(depth_key: str, calibration_sha256: str, config: CorrectionConfig) -> str:
+def product_key(depth_key: str, calibration_sha256: str, config: CorrectionConfig, repair_encoder: bool) -> str:
     """What a product depends on; the height of its strips is not among it, they give the same bits at any."""
     options = asdict(config)
     del options["strip_rows"]
-    return key_of(depth_key, calibration_sha256, options)
+    return key_of(depth_key, calibration_sha256, options, repair_encoder)

@@ -55,12 +55,12 @@ def scan_job(planned: PlannedScan, place: Place) -> Job:
     work = place.output / WORK_FOLDER / key_of(planned.key)[:16]
     work.mkdir(parents=True, exist_ok=True)
     processing = place.processing
-    depth_key = disparity_key(row.input_sha256, processing.disparity, processing.repair_encoder, __version__)
-    depth = work / f"depth-{depth_key[:16]}.zarr" if planned.matched else None
+    depth_key = disparity_key(row.input_sha256, processing.disparity, processing.with_sigma, __version__)
+    depth = work / f"depth-{depth_key[:16]}" if planned.matched else None
     if depth is not None:
         yield _matching(planned, place, depth, depth_key)
 
-    key = product_key(depth_key, planned.calibration.sha256, processing.correction)
+    key = product_key(depth_key, planned.calibration.sha256, processing.correction, processing.repair_encoder)
     strips_key = key_of(key, planned.correction.strip_rows)
     product, target = work / f"product-{strips_key[:16]}.zarr", product_path(place.output, planned.key)
     if not _is_renamed(planned, place, product, target, strips_key):
@@ -86,12 +86,13 @@ def verify_job(planned: PlannedScan, place: Place) -> Job:
 
 
 def _matching(planned: PlannedScan, place: Place, depth: Path, key: str) -> list[Task]:
-    config = place.processing.disparity
+    config, with_sigma = place.processing.disparity, place.processing.with_sigma
     if not depth.is_dir():
         place.ledger.forget_strips(planned.key, "disparity")
-        create_depth_store(depth, planned.lines, planned.width, config.strip_lines)
+        create_depth_store(depth, planned.lines, planned.width, config.strip_lines, with_sigma=with_sigma)
     count = -(-planned.lines // config.strip_lines)
-    work = [MatchStrip(_files(planned, place), number, str(depth), config) for number in range(count)]
+    files = _files(planned, place)
+    work = [MatchStrip(files, number, str(depth), config, with_sigma) for number in range(count)]
     return _missing(planned, place, "disparity", key, work)
 
 

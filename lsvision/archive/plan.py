@@ -36,6 +36,11 @@ class Processing:
     worker_memory_mb: int
 
     @property
+    def with_sigma(self) -> bool:
+        """Whether the standard deviation of the matched depth is kept with it."""
+        return self.correction.uncertainty and self.disparity.refine_iterations > 0
+
+    @property
     def sha256(self) -> str:
         """Hash of what the products depend on; the height of strips of rows is not among it."""
         correction = asdict(self.correction)

@@ -25,6 +25,9 @@ from lsvision.stages.correction import CorrectionConfig, correct_rows, plan_prod
 from lsvision.stages.disparity import DisparityConfig, MatchedDepth
 from lsvision.types import LineImage, Motion, Scan
 
+# The arrays of the working store.
+DEPTH, SIGMA = "depth.zarr", "sigma.zarr"
+
 log = logging.getLogger(__name__)
 
 
@@ -61,20 +64,25 @@ class HashInput:
 
 @dataclass(frozen=True)
 class MatchStrip:
-    """The depth of one strip of a scan, into its chunk of the working store."""
+    """The depth of one strip of a scan, with its standard deviation if asked to, into chunks of the working store."""
 
     scan: ScanFiles
     number: int
     depth: str
     config: DisparityConfig
+    with_sigma: bool
 
     def run(self) -> TaskResult:
         """Match the strip."""
         scan = _open_scan(self.scan)
         start = self.number * self.config.strip_lines
         stop = min(start + self.config.strip_lines, scan.lines)
-        z = MatchedDepth(scan, self.config, kept_strips=1).read(start, stop)[..., 0]
-        zarr.open_array(self.depth, mode="r+")[start:stop] = z.numpy()
+        matched = MatchedDepth(scan, self.config, kept_strips=1)
+        z = matched.read(start, stop)[..., 0]
+        zarr.open_array(f"{self.depth}/{DEPTH}", mode="r+")[start:stop] = z.numpy()
+        if self.with_sigma:
+            sigma = matched.read_sigma(start, stop)[..., 0]
+            zarr.open_array(f"{self.depth}/{SIGMA}", mode="r+")[start:stop] = sigma.numpy()
         return TaskResult(lines=stop - start, measured=int(torch.isfinite(z).sum()))
 
 
@@ -93,14 +101,14 @@ class CorrectStrip:
     def run(self) -> TaskResult:
         """Correct the rows."""
         scan = _open_scan(self.scan)
-        depth = scan.depth if self.depth is None else _open_depth(self.depth)
+        depth, sigma = (scan.depth, None) if self.depth is None else _open_depth(self.depth)
         if depth is None:
             raise FileFormatError(scan.path, "its depth map is gone")
         motion = Motion(*(torch.tensor(values, dtype=torch.float64) for values in (self.n, self.covariance)))
         grid = plan_product(scan, motion, self.config)
         first = self.number * self.config.strip_rows
         rows = first, min(first + self.config.strip_rows, grid.rows)
-        strip = correct_rows(scan, depth, motion, self.config, grid, rows)
+        strip = correct_rows(scan, depth, motion, self.config, grid, rows, sigma)
         ProductRows(self.product).write(strip.row, strip.color, strip.height, strip.valid, strip.source, strip.sigma)
         return TaskResult(lines=rows[1] - rows[0], measured=int(strip.valid.sum()))
 
@@ -170,18 +178,19 @@ def run_task(task: Task) -> TaskResult:
     return dataclasses.replace(result, seconds=time.perf_counter() - begin)
 
 
-def create_depth_store(path: Path, lines: int, width: int, strip_lines: int) -> None:
+def create_depth_store(path: Path, lines: int, width: int, strip_lines: int, *, with_sigma: bool) -> None:
     """Lay out an empty store of depth, float32 mm, NaN for none, a chunk a strip; it is there whole or not at all."""
     partial = path.with_name(f"{path.name}.partial")
     shutil.rmtree(partial, ignore_errors=True)
-    zarr.create_array(
-        partial,
-        shape=(lines, width),
-        chunks=(min(strip_lines, lines), width),
-        dtype=np.float32,
-        fill_value=np.nan,
-        compressors=[ZstdCodec(level=1, checksum=True)],
-    )
+    for name in (DEPTH, SIGMA) if with_sigma else (DEPTH,):
+        zarr.create_array(
+            partial / name,
+            shape=(lines, width),
+            chunks=(min(strip_lines, lines), width),
+            dtype=np.float32,
+            fill_value=np.nan,
+            compressors=[ZstdCodec(level=1, checksum=True)],
+        )
     partial.rename(path)
 
 
@@ -202,5 +211,7 @@ def _open_scan(files: ScanFiles) -> Scan:
 
 
 @lru_cache(maxsize=2)
-def _open_depth(path: str) -> LineImage:
-    return open_line_image(path)
+def _open_depth(path: str) -> tuple[LineImage, LineImage | None]:
+    """Depth and its standard deviation, where that was asked for."""
+    sigma = Path(path, SIGMA)
+    return open_line_image(Path(path, DEPTH)), open_line_image(sigma) if sigma.is_dir() else None

@@ -2,15 +2,19 @@
 
 import json
 import shutil
+from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
+import zarr
 
 from lsvision.archive import LEDGER_FILE, Ledger
 from lsvision.archive.tasks import CorrectStrip, HashInput, MatchStrip
 from lsvision.io import read_calibration, read_product, read_scan
 from lsvision.stages.correction import correct_scan
 from lsvision.stages.disparity import depth_of
+from lsvision.stages.uncertainty import sigma_of
 from tests.archive.archives import (
     PROCESSING,
     InProcess,
@@ -56,6 +60,18 @@ def test_a_product_is_that_of_the_bare_stages(archive, calibration, undisturbed,
 def test_two_workers_make_the_same_products(archive, calibration, undisturbed, tmp_path):
     process(archive, calibration, tmp_path / "o", local(2))
     assert_same_products(undisturbed, tmp_path / "o")
+
+
+def test_uncertainty_is_that_of_the_bare_stages(archive, calibration, tmp_path):
+    processing = replace(PROCESSING, correction=replace(PROCESSING.correction, uncertainty=True))
+    process(archive, calibration, tmp_path / "o", processing=processing)
+    scan, motion = read_scan(archive / "b"), read_calibration(calibration).motion
+    depth = depth_of(scan, PROCESSING.disparity)
+    strips = correct_scan(scan, depth, motion, processing.correction, depth_sigma=sigma_of(depth))
+    sigma = torch.cat([strip.sigma for strip in strips])
+    assert bool(torch.isfinite(sigma).any())
+    stored = np.moveaxis(zarr.open_array(tmp_path / "o" / "b.zarr" / "sigma" / "0", mode="r")[:], 0, -1)
+    np.testing.assert_array_equal(stored, sigma.numpy())
 
 
 @pytest.mark.parametrize("rows", [16, 512])

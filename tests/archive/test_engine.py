@@ -1,0 +1,103 @@
+"""Workers that die, and engines that bring every task back once."""
+
+import os
+import signal
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from lsvision.archive import EngineConfig, LocalEngine, worker_count
+from lsvision.archive.tasks import Task, TaskResult, run_task
+from lsvision.errors import FileFormatError
+
+
+@dataclass(frozen=True)
+class Deadly:
+    """Kills its worker as often as told, which it counts in a file."""
+
+    count: str
+    times: int
+
+    def run(self) -> TaskResult:
+        with Path(self.count).open("a") as file:
+            file.write("x")
+        if Path(self.count).stat().st_size <= self.times:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return TaskResult(value="survived")
+
+
+@dataclass(frozen=True)
+class Faulty:
+    """Raises."""
+
+    error: Exception
+
+    def run(self) -> TaskResult:
+        raise self.error
+
+
+@dataclass(frozen=True)
+class Number:
+    """Says its number."""
+
+    number: int
+
+    def run(self) -> TaskResult:
+        return TaskResult(measured=self.number)
+
+
+def collected(engine, tasks) -> dict:
+    waiting, found, out = list(tasks), [], 0
+    while waiting or out:
+        while waiting and out < engine.capacity:
+            engine.submit(waiting.pop())
+            out += 1
+        finished = engine.collect()
+        out -= len(finished)
+        found += finished
+    assert len(dict(found)) == len(found)
+    return dict(found)
+
+
+def test_every_task_comes_back_once_though_workers_die(tmp_path):
+    tasks = [Task("a", Number(number)) for number in range(12)]
+    once, always = Task("b", Deadly(str(tmp_path / "once"), 1)), Task("c", Deadly(str(tmp_path / "always"), 9))
+    with LocalEngine(2) as engine:
+        found = collected(engine, [*tasks, once, always])
+    assert [found[task].measured for task in tasks] == list(range(12))
+    assert found[once].value == "survived"
+    assert found[always].error == "2 workers died at it, of memory or a signal"
+    assert (tmp_path / "always").stat().st_size == 2
+
+
+@pytest.mark.slow
+def test_dask_brings_every_task_back_once_though_workers_die(tmp_path):
+    pytest.importorskip("distributed")
+    from lsvision.archive.dask_engine import DaskEngine
+
+    tasks = [Task("a", Number(number)) for number in range(12)]
+    once, always = Task("b", Deadly(str(tmp_path / "once"), 1)), Task("c", Deadly(str(tmp_path / "always"), 9))
+    with DaskEngine(None, 2, 3072) as engine:
+        found = collected(engine, [*tasks, once, always])
+    assert [found[task].measured for task in tasks] == list(range(12))
+    assert found[once].value == "survived"
+    assert found[always].error == "2 workers died at it, of memory or a signal"
+
+
+@pytest.mark.parametrize(
+    ("error", "told"),
+    [
+        (FileFormatError("left.tif", "cut short"), "left.tif: cut short"),
+        (OSError(28, "No space left on device", "a.zarr"), "a.zarr: No space left on device"),
+        (MemoryError("of 9 GB"), "MemoryError: of 9 GB"),
+    ],
+)
+def test_what_is_wrong_with_the_data_is_a_result(error, told):
+    assert run_task(Task("a", Faulty(error))).error == told
+
+
+def test_workers_as_asked_for_or_as_memory_allows():
+    assert worker_count(EngineConfig(workers=7)) == 7
+    assert worker_count(EngineConfig(worker_memory_mb=1 << 30)) == 1
+    assert 1 <= worker_count(EngineConfig()) <= (os.cpu_count() or 1)

@@ -1,0 +1,75 @@
+"""Strips that fit the memory, what a run takes, and the ledger that says what is done."""
+
+from dataclasses import replace
+
+import pytest
+
+from lsvision.archive import Ledger, ScanRow, StripRow, find_scans, ledger_lines, read_calibrations
+from lsvision.archive.plan import IDLE_BYTES, plan_run, predicted_bytes, predicted_seconds, rows_for_memory
+from lsvision.errors import FileFormatError
+from tests.archive.archives import PROCESSING
+
+
+@pytest.mark.parametrize(
+    ("megabytes", "rows"), [(10_000, 512), (2_000, 512), (1_000, 256), (900, 128), (850, 64), (800, 32)]
+)
+def test_rows_fit_the_memory(megabytes, rows):
+    most = 512
+    memory = megabytes * 2**20
+    found = rows_for_memory(1786, 100, most, memory)
+    assert found == rows
+    assert IDLE_BYTES + (found + 100) * 1786 * 400 <= memory
+
+
+def test_too_little_memory_says_how_much_it_takes():
+    with pytest.raises(ValueError, match=r"a worker needs 1059 MB for 32 rows of 7142 px, it may take 800 MB"):
+        rows_for_memory(7142, 100, 512, 800 * 2**20)
+
+
+def test_a_scan_too_wide_for_a_worker_is_faulty(archive, calibration, tmp_path):
+    small = replace(PROCESSING, worker_memory_mb=100)
+    plan = plan_run(find_scans(str(archive)), read_calibrations(calibration), small, {}, tmp_path)
+    assert not plan.to_do
+    assert all("MB" in problem for problem in plan.faulty.values())
+
+
+def test_time_and_size_before_it_starts(archive, calibration, tmp_path):
+    plan = plan_run(find_scans(str(archive)), read_calibrations(calibration), PROCESSING, {}, tmp_path)
+    rows = sum(scan.grid.rows for scan in plan.to_do)
+    assert predicted_seconds(plan, {"disparity": 0.5, "product": 2.0}, 2) == (0.5 * (90 + 40) + 2.0 * rows) / 2
+    cells = sum(scan.grid.rows * scan.grid.columns for scan in plan.to_do)
+    assert predicted_bytes(plan) == 16 * cells + 4 * 64 * (90 + 40)
+
+
+def test_rows_come_back_and_runs_of_a_strip_are_counted(tmp_path):
+    scan = ScanRow("ä/1", "/ä/1", "done", lines=7, seconds=0.1 + 0.2, measured=0.5, stamp="s", input_sha256="i")
+    strip = StripRow("ä/1", "product", 3, "key", "done", lines=7, seconds=0.25, measured=11)
+    with Ledger(tmp_path / "ledger.sqlite") as ledger:
+        ledger.put_scan(scan)
+        ledger.put_strip(strip)
+        ledger.put_strip(strip)
+    with Ledger(tmp_path / "ledger.sqlite") as ledger:
+        assert ledger.scans() == {"ä/1": scan}
+        assert ledger.scan("other") is None
+        assert ledger.strips() == [replace(strip, runs=2)]
+        assert list(ledger.done("ä/1", "product", "key")) == [3]
+        assert not ledger.done("ä/1", "product", "another key")
+        assert ledger.seconds_per_line() == {"product": 0.25 / 7}
+        ledger.put_strip(replace(strip, key="another key"))
+        assert ledger.strips()[0].runs == 1
+        ledger.forget_strips("ä/1", "product")
+        assert not ledger.strips()
+
+
+def test_a_ledger_in_words():
+    rows = {"a": ScanRow("a", "/a", "done", lines=7, measured=0.5), "bb": ScanRow("bb", "/bb", "failed", error="why")}
+    assert list(ledger_lines(rows)) == [
+        "a   done          0.0 s  7 lines, 50.0 % measured",
+        "bb  failed        0.0 s  why",
+    ]
+
+
+def test_what_is_no_ledger(tmp_path):
+    (tmp_path / "ledger.sqlite").write_text("something else, long enough to be read as the head of a database")
+    with pytest.raises(FileFormatError, match="not a ledger"):
+        Ledger(tmp_path / "ledger.sqlite")
