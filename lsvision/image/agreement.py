@@ -52,7 +52,7 @@ def fill_from_background(disparity: Float[Tensor, "lines width"]) -> Float[Tenso
 
     None where nothing is known.
     """
-    known = torch.isfinite(disparity)
+    known = disparity == disparity  # not NaN, in one pass
     if not bool(known.any()):
         return None
     width = disparity.shape[1]
@@ -62,7 +62,10 @@ def fill_from_background(disparity: Float[Tensor, "lines width"]) -> Float[Tenso
     left = torch.where(before >= 0, disparity.gather(1, before.clamp(min=0)), torch.inf)
     right = torch.where(after < width, disparity.gather(1, after.clamp(max=width - 1)), torch.inf)
     filled = torch.minimum(left, right)
-    return torch.where(torch.isfinite(filled), filled, disparity.nanmedian())
+    empty = ~known.any(1)
+    if bool(empty.any()):
+        filled[empty] = disparity.nanmedian()
+    return filled
 
 
 def _partner(disparity: Tensor, whole: Tensor) -> tuple[Tensor, Tensor]:

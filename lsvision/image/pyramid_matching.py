@@ -22,8 +22,10 @@ _AROUND = (-8, 7)  # disparities tried around the coarse one, px of half the siz
 # Surfaces that differ by less over a neighbourhood of the small copy, px of it, are within reach of one search.
 _TWO_SURFACES_PX = 5.0
 _NEIGHBOURHOOD = 5
+_ROOM_PX = 64
 _SMOOTH_PX = 2.0  # a larger step between neighbours is an edge, over which nothing is interpolated
 _COARSE_SPECKLE = 2  # times the pixels of a speckle: what is removed here is found again at half the size
+_BAND = 64  # lines of the full size worked on at once
 _COST_BLOCK, _COST_LIMIT, _NO_MATCH = 5, 60, 255.0
 
 
@@ -69,16 +71,33 @@ def match_coarse_to_fine(
         return left.new_full((lines, width), torch.nan, dtype=torch.float32)
     check = round(fine_check_px / 2)
     matcher = sgbm_matcher(_AROUND, block_size, penalties, check, uniqueness_percent, 0)
-    found = (_match_around(matcher, half_left, half_right, base) for base in _surfaces(coarse))
-    (near, near_cost), (far, far_cost) = found
-    disparity = _without_speckles(torch.where(near_cost <= far_cost, near, far), speckle_px)
-    disparity = agreeing(disparity, torch.minimum(near_cost, far_cost), check)
-    grey_left, grey_right = half_left.to(torch.float32), half_right.to(torch.float32)
-    disparity = refine_disparity(grey_left, grey_right, disparity, window=9, iterations=1, noise=noise).disparity
-    full = _enlarged(2 * disparity, (2 * half_left.shape[0], 2 * half_left.shape[1]))[:lines, :width]
-    partner = torch.arange(width) - full
-    inside = (partner >= 0) & (partner <= width - 1) & (full > minimum_px - 1) & (full < maximum_px + 1)
-    return torch.where(inside, full, torch.nan)
+    near, far = _surfaces(coarse)
+    disparity, cost = _match_around(matcher, half_left, half_right, near, slice(0, near.shape[1]))
+    columns = _where_two(near, far)
+    if columns is not None:
+        behind, behind_cost = _match_around(matcher, half_left, half_right, far, columns)
+        better = behind_cost < cost[:, columns]
+        disparity[:, columns] = torch.where(better, behind, disparity[:, columns])
+        cost[:, columns] = torch.minimum(behind_cost, cost[:, columns])
+    disparity = agreeing(_without_speckles(disparity, speckle_px), cost, check)
+    disparity = refine_disparity(half_left, half_right, disparity, window=9, iterations=1, noise=noise).disparity
+    return _full_size(disparity, lines, width, minimum_px, maximum_px)
+
+
+def _full_size(half: Tensor, lines: int, width: int, minimum_px: int, maximum_px: int) -> Tensor:
+    """Disparity at full size, without what lies beyond the range or has its partner beyond the image."""
+    full = half.new_empty(lines, width)
+    column = torch.arange(width)
+    for start in range(0, lines, _BAND):
+        # A line more on either side, which the interpolation looks at.
+        above, below = max(start // 2 - 1, 0), min((start + _BAND) // 2 + 1, half.shape[0])
+        enlarged = _enlarged(2 * half[above:below], (2 * (below - above), 2 * half.shape[1]))
+        band = full[start : start + _BAND]
+        band.copy_(enlarged[start - 2 * above :, :width][: len(band)])
+        partner = column - band
+        outside = (partner < 0) | (partner > width - 1) | (band <= minimum_px - 1) | (band >= maximum_px + 1)
+        band.masked_fill_(outside, torch.nan)
+    return full
 
 
 def _reduced(image: Tensor) -> tuple[Tensor, Tensor]:
@@ -101,22 +120,33 @@ def _surfaces(coarse: Tensor) -> tuple[Tensor, Tensor]:
     return near, far
 
 
-def _match_around(matcher: cv2.StereoSGBM, left: Tensor, right: Tensor, base: Tensor) -> tuple[Tensor, Tensor]:
-    """Disparity by a search around a base, and how badly it fits: the mean absolute difference over a block."""
-    disparity = base + run_sgbm(matcher, left, _warped(right, base), _AROUND[1])
-    partner = torch.arange(left.shape[1]) - disparity
-    disparity = torch.where((partner > -0.5) & (partner < left.shape[1] - 0.5), disparity, torch.nan)
-    difference = cv2.absdiff(_warped(right, torch.nan_to_num(disparity)).numpy(), left.numpy())
+def _where_two(near: Tensor, far: Tensor) -> slice | None:
+    """The columns within which two surfaces are near each other, with room for a search; None where there are none."""
+    apart = (near > far).any(0).nonzero()
+    if not len(apart):
+        return None
+    return slice(max(int(apart[0]) - _ROOM_PX, 0), min(int(apart[-1]) + _ROOM_PX + 1, near.shape[1]))
+
+
+def _match_around(
+    matcher: cv2.StereoSGBM, left: Tensor, right: Tensor, base: Tensor, columns: slice
+) -> tuple[Tensor, Tensor]:
+    """Disparity in some columns by a search around a base, and how badly it fits: mean absolute difference by block."""
+    left, base = left[:, columns].contiguous(), base[:, columns]
+    column = torch.arange(columns.start, columns.stop, dtype=torch.float32)
+    disparity = base + run_sgbm(matcher, left, _sampled(right, column - base), _AROUND[1])
+    partner = column - disparity
+    disparity = torch.where((partner > -0.5) & (partner < right.shape[1] - 0.5), disparity, torch.nan)
+    difference = cv2.absdiff(_sampled(right, torch.nan_to_num(partner)).numpy(), left.numpy())
     cost = torch.from_numpy(cv2.blur(difference.clip(max=_COST_LIMIT), (_COST_BLOCK, _COST_BLOCK))).to(torch.float32)
     return disparity, torch.where(disparity.isnan(), _NO_MATCH, cost)
 
 
-def _warped(image: Tensor, disparity: Tensor) -> Tensor:
-    lines, width = disparity.shape
-    column = torch.arange(width, dtype=torch.float32) - disparity
-    line = torch.arange(lines, dtype=torch.float32)[:, None].expand(lines, width).contiguous()
-    warped = cv2.remap(image.numpy(), column.numpy(), line.numpy(), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return torch.from_numpy(warped)
+def _sampled(image: Tensor, column: Tensor) -> Tensor:
+    """Values of an image at fractional columns of each line."""
+    line = torch.arange(column.shape[0], dtype=torch.float32)[:, None].expand_as(column).contiguous()
+    sampled = cv2.remap(image.numpy(), column.numpy(), line.numpy(), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return torch.from_numpy(sampled)
 
 
 def _without_speckles(disparity: Tensor, size: int) -> Tensor:

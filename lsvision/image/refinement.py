@@ -1,10 +1,12 @@
 """Sub-pixel disparity by local least squares on the warped pair, and how well it is known."""
 
+import math
 from dataclasses import dataclass
 
+import cv2
 import torch
 import torch.nn.functional as F  # noqa: N812
-from jaxtyping import Float
+from jaxtyping import Float, Shaped
 from torch import Tensor
 
 # Lines worked on at once: the two dozen intermediate images then stay in the processor's cache.
@@ -14,26 +16,27 @@ _ROUNDING = 1.0 / 6.0  # variance of the difference of two whole grey values
 # Variance of half the difference of two neighbours over that of the residual: half a pixel's noise, over one pixel's
 # and that of another which interpolation has smoothed to 0.6 of it on average.
 _SLOPE_NOISE = 0.5 / 1.6
+_NOISE_RESIDUAL = 2.0  # times the noise of one image; that of two is 1.4
 
 
 @dataclass(frozen=True)
 class RefinedDisparity:
-    """Disparity and its standard deviation, px, and the rms grey value that no shift explains; NaN as the start."""
+    """Disparity and its standard deviation, px; NaN where there is none."""
 
     disparity: Float[Tensor, "lines width"]
     sigma: Float[Tensor, "lines width"]
-    residual: Float[Tensor, "lines width"]
 
 
 def refine_disparity(
-    left: Float[Tensor, "lines width"],
-    right: Float[Tensor, "lines width"],
+    left: Shaped[Tensor, "lines width"],
+    right: Shaped[Tensor, "lines width"],
     disparity: Float[Tensor, "lines width"],
     *,
     window: int,
     iterations: int,
     noise: float,
     largest_change_px: float = 1.0,
+    largest_sigma_px: float | None = None,
 ) -> RefinedDisparity:
     """Improve a disparity map good to about a pixel; NaN stays NaN.
 
@@ -41,8 +44,7 @@ def refine_disparity(
     one best; brightness may differ by an offset. Semi-global matching interpolates its costs, which pulls disparities
     towards whole pixels; this does not. Where a window has no texture, the disparity stays.
 
-    The standard deviation follows from the residuals left in the window and the texture that holds the disparity, and
-    is never below that of the given noise alone.
+    The standard deviation follows from the residuals left in the window and the texture that holds the disparity.
 
     Args:
         left, right: grey values of the pair.
@@ -50,60 +52,59 @@ def refine_disparity(
         iterations: at least one.
         noise: standard deviation of the grey values' noise, on their scale.
         largest_change_px: a larger total change is not believed and undone.
+        largest_sigma_px: a pixel known less well is dropped, unless its residual is no more than noise: ground without
+            texture says little, but a wrong match says the wrong thing.
 
     Source: Lucas & Kanade 1981, in one dimension; Baker & Matthews 2004 for the slope of the image that is not warped.
     """
     lines, reach = left.shape[0], 2 * iterations * (window // 2)
-    refined, sigma, residual = (torch.empty_like(disparity) for _ in range(3))
-    scatter = _scatter_gain(window, iterations)
+    refined, sigma = torch.empty_like(disparity), torch.empty_like(disparity)
+    scatter, largest = _scatter_gain(window, iterations), largest_sigma_px or math.inf
     for start in range(0, lines, _BAND):
         stop = min(start + _BAND, lines)
         above, below = max(start - reach, 0), min(stop + reach, lines)
-        pair, first = (left[above:below], right[above:below]), disparity[above:below]
-        current, deviation, unexplained = _refine_band(pair, first, window, iterations, noise, largest_change_px)
-        inner = slice(start - above, stop - above)
-        refined[start:stop], sigma[start:stop] = current[inner], scatter * deviation[inner]
-        residual[start:stop] = unexplained[inner]
-    return RefinedDisparity(refined, sigma, residual)
+        pair = left[above:below].to(disparity.dtype), right[above:below].to(disparity.dtype)
+        current, deviation, residual = _refine_band(pair, disparity[above:below], window, iterations, noise)
+        inner, band = slice(start - above, stop - above), slice(start, stop)
+        torch.mul(deviation[inner], scatter, out=sigma[band])
+        change = (current[inner] - disparity[band]).abs_()
+        torch.where(change <= largest_change_px, current[inner], disparity[band], out=refined[band])
+        dropped = (sigma[band] > largest) & (residual[inner] > _NOISE_RESIDUAL * noise)
+        for values in (refined, sigma):
+            values[band].masked_fill_(dropped, torch.nan)
+    return RefinedDisparity(refined, sigma)
 
 
 def _refine_band(
-    pair: tuple[Tensor, Tensor],
-    disparity: Tensor,
-    window: int,
-    iterations: int,
-    noise: float,
-    largest_change_px: float,
+    pair: tuple[Tensor, Tensor], disparity: Tensor, window: int, iterations: int, noise: float
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Refined disparity, the standard deviation of one least-squares step, and the rms residual."""
     left, right = pair
-    start = torch.nan_to_num(disparity)
-    known = torch.isfinite(disparity).to(left.dtype)
+    missing = disparity - disparity  # NaN where there is none
+    known = (missing == 0).to(left.dtype)
+    current = torch.nan_to_num(disparity)
     count = _window_sum(known, window).clamp_(min=0.5)
     # The left image's slope: its noise is independent of the right one's, which interpolation smooths between pixels,
     # and a slope that shares that noise would pull disparities towards the middle between them.
-    slope = F.pad(left[:, 2:] - left[:, :-2], (1, 1)) / 2 * known
-    mean_slope = _window_sum(slope, window) / count
-    texture = _window_sum(slope * slope, window) / count - mean_slope * mean_slope
+    slope = F.pad(left[:, 2:] - left[:, :-2], (1, 1)).mul_(0.5).mul_(known)
+    mean_slope = _window_sum(slope, window).div_(count)
+    texture = _window_sum(slope * slope, window).div_(count).addcmul_(mean_slope, mean_slope, value=-1)
     # The window's mean of noise times slope; the prior keeps untextured ground where matching put it.
     prior = 4.0 * noise**2 / window**2
     energy = texture + prior
-    current = start
     for _ in range(iterations):
         current = _smoothed(current, known, count, window)
-        residual = (left - _warp_rows(right, current)) * known
-        mean_residual = _window_sum(residual, window) / count
-        pull = _window_sum(slope * residual, window) / count - mean_slope * mean_residual
+        residual = (left - _warp_rows(right, current)).mul_(known)
+        mean_residual = _window_sum(residual, window).div_(count)
+        pull = _window_sum(slope * residual, window).div_(count).addcmul_(mean_slope, mean_residual, value=-1)
         step = pull / energy
         current = current - step.clamp(-0.5, 0.5)
-    spread = _window_sum(residual * residual, window) / count - mean_residual * mean_residual
-    unexplained = ((spread - pull * step) * count / (count - 2).clamp(min=1)).clamp(min=_ROUNDING)
+    spread = _window_sum(residual * residual, window).div_(count).addcmul_(mean_residual, mean_residual, value=-1)
+    unexplained = spread.addcmul_(pull, step, value=-1).mul_(count / (count - 2).clamp_(min=1)).clamp_(min=_ROUNDING)
     # The slope's own noise looks like texture but holds nothing.
-    held = (texture - _SLOPE_NOISE * unexplained).clamp(min=0) + prior
-    sigma = (unexplained * energy.clamp(min=0) / count).sqrt() / held
-    changed = ((current - start).abs() > largest_change_px).to(left.dtype)
-    missing = disparity - disparity  # NaN where there was none
-    return current + changed * (start - current) + missing, sigma + missing, unexplained.sqrt() + missing
+    held = texture.sub_(unexplained, alpha=_SLOPE_NOISE).clamp_(min=0).add_(prior)
+    sigma = (unexplained * energy.clamp_(min=0)).div_(count).sqrt_().div_(held)
+    return current.add_(missing), sigma.add_(missing), unexplained.sqrt_()
 
 
 def _smoothed(current: Tensor, known: Tensor, count: Tensor, window: int) -> Tensor:
@@ -146,19 +147,5 @@ def _warp_rows(image: Tensor, disparity: Tensor) -> Tensor:
 
 def _window_sum(values: Tensor, window: int) -> Tensor:
     """Sum over a square window, at the rim over the part of it within the image."""
-    pad = window // 2
-    return _run_sum(_run_sum(F.pad(values, (pad, pad, pad, pad)), window, 1), window, 0)
-
-
-def _run_sum(values: Tensor, length: int, dim: int) -> Tensor:
-    """Sums over runs of ``length``, by doubling: a few additions instead of one for each of the run."""
-    kept = values.shape[dim] - length + 1
-    total, done, power, run = None, 0, 1, values
-    while True:
-        if length & power:
-            part = run.narrow(dim, done, kept)
-            total, done = part if total is None else total + part, done + power
-        if done == length:
-            return total  # type: ignore[return-value]
-        run = run.narrow(dim, 0, run.shape[dim] - power) + run.narrow(dim, power, run.shape[dim] - power)
-        power *= 2
+    size = window, window
+    return torch.from_numpy(cv2.boxFilter(values.numpy(), -1, size, normalize=False, borderType=cv2.BORDER_CONSTANT))

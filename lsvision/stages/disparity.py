@@ -92,12 +92,9 @@ def measure_strip(left: Tensor, right: Tensor, rig: Rig, config: DisparityConfig
         window=config.refine_window,
         iterations=config.refine_iterations,
         noise=config.refine_noise,
+        largest_sigma_px=config.largest_sigma_px,
     )
-    if config.largest_sigma_px is None:
-        return StripMatch(refined.disparity, refined.sigma)
-    # On ground without texture little is known, but it is not wrong: there the residual is the sensor's noise.
-    kept = (refined.sigma <= config.largest_sigma_px) | (refined.residual <= 2.0 * config.refine_noise)
-    return StripMatch(*(torch.where(kept, values, torch.nan) for values in (refined.disparity, refined.sigma)))
+    return StripMatch(refined.disparity, refined.sigma)
 
 
 def _search(left: Tensor, right: Tensor, rig: Rig, config: DisparityConfig) -> Tensor:
@@ -119,7 +116,7 @@ def _search(left: Tensor, right: Tensor, rig: Rig, config: DisparityConfig) -> T
 
 def _grey(image: Tensor) -> Tensor:
     """Brightness on a scale of 0..255, on which the noise is given."""
-    return grey_bytes(image).to(torch.float32) if image.dtype == torch.uint8 else gray(image) / 257.0
+    return grey_bytes(image) if image.dtype == torch.uint8 else gray(image) / 257.0
 
 
 def depth_from_disparity(disparity: Tensor, rig: Rig) -> Tensor:
