@@ -1,6 +1,7 @@
 """Resampling of images at given positions, by ``grid_sample`` or by OpenCV."""
 
 import math
+from collections.abc import Sequence
 from typing import Literal
 
 import cv2
@@ -29,30 +30,47 @@ def sample_image(
     coarser: tuple[float, float] = (1.0, 1.0),
     resampler: Resampler = "grid_sample",
 ) -> Tensor:
-    """Sample an image ``(lines, width, channels)`` at positions in px; ``(rows, columns, channels)`` of its dtype.
+    """Sample one image ``(lines, width, channels)``; see ``sample_images``."""
+    return sample_images((image,), column, line, mode, coarser=coarser, resampler=resampler)[0]
+
+
+def sample_images(
+    images: Sequence[Tensor],
+    column: Float[Tensor, "rows columns"],
+    line: Float[Tensor, "rows columns"],
+    mode: Interpolation,
+    *,
+    coarser: tuple[float, float] = (1.0, 1.0),
+    resampler: Resampler = "grid_sample",
+) -> list[Tensor]:
+    """Sample images ``(lines, width, channels)`` of one size at positions in px, all of them in one call.
 
     Positions are rounded to 1/2048 px: cut from a larger image, at any place, an image gives the same bits, up to the
     rim of ``sampling_reach``. Positions outside are clamped to the rim; NaN positions give 0.
 
     Args:
-        coarser: distance of neighbouring samples in lines and in columns; where it exceeds 1, the image is smoothed
+        coarser: distance of neighbouring samples in lines and in columns; where it exceeds 1, the images are smoothed
             first, so that no detail finer than the samples turns into a false pattern.
+
+    Returns:
+        ``(rows, columns, channels)`` of each image, in its dtype.
 
     Raises:
         ValueError: the positions spread over more than 8192 px; sample tile by tile.
     """
     known = torch.isfinite(column + line)
     complete = bool(known.all())
-    if not (complete or bool(known.any())):
-        return image.new_zeros(*column.shape, image.shape[2])
-    row, lines = _along(line, None if complete else known, image.shape[0])
-    place, columns = _along(column, None if complete else known, image.shape[1])
-    window = _window(image, lines, columns, coarser)
+    if not complete:
+        any_known = int(known.flatten().to(torch.uint8).argmax())
+        if not bool(known.flatten()[any_known]):
+            return [image.new_zeros(*column.shape, image.shape[2]) for image in images]
+        column, line = (torch.where(known, at, at.flatten()[any_known]) for at in (column, line))
+    row, lines = _along(line, images[0].shape[0])
+    place, columns = _along(column, images[0].shape[1])
+    windows = [_window(image, lines, columns, coarser) for image in images]
     sample = _remap if resampler == "opencv" else _grid_sample
-    sampled = sample(window, place, row, mode)
-    if image.dtype != sampled.dtype:
-        sampled = sampled.round_().clamp_(0.0, float(torch.iinfo(image.dtype).max)).to(image.dtype)
-    return sampled if complete else torch.where(known[..., None], sampled, 0)
+    made = [_as_dtype(part, image.dtype) for part, image in zip(sample(windows, place, row, mode), images, strict=True)]
+    return made if complete else [torch.where(known[..., None], part, 0) for part in made]
 
 
 def sampling_reach(coarser: float) -> int:
@@ -60,18 +78,20 @@ def sampling_reach(coarser: float) -> int:
     return _REACH + _radius(coarser)
 
 
-def _along(position: Tensor, known: Tensor | None, size: int) -> tuple[Tensor, tuple[int, int]]:
+def _along(position: Tensor, size: int) -> tuple[Tensor, tuple[int, int]]:
     """Positions on one axis in rounded parts from the start of the window they need, float32; and that window."""
     position = position.clamp(0, size - 1)
-    if known is None:
-        low, high = (float(end) for end in torch.aminmax(position))
-    else:
-        low = float(torch.where(known, position, math.inf).amin())
-        high = float(torch.where(known, position, -math.inf).amax())
+    low, high = (float(end) for end in torch.aminmax(position))
     start, stop = math.floor(low) - _REACH, math.ceil(high) + _REACH + 1
     if stop - start > _LARGEST_WINDOW:
         raise ValueError(f"positions: expected a spread of at most {_LARGEST_WINDOW} px, got {stop - start}")
     return position.sub_(start).mul_(_PARTS).round_().to(torch.float32), (start, stop)
+
+
+def _as_dtype(sampled: Tensor, dtype: torch.dtype) -> Tensor:
+    if sampled.dtype == dtype or dtype.is_floating_point:
+        return sampled.to(dtype)
+    return sampled.round_().clamp_(0.0, float(torch.iinfo(dtype).max)).to(dtype)
 
 
 def _window(image: Tensor, lines: tuple[int, int], columns: tuple[int, int], coarser: tuple[float, float]) -> Tensor:
@@ -123,25 +143,24 @@ def _smoothed(image: Tensor, axis: int, coarser: float) -> Tensor:
     return smooth
 
 
-def _grid_sample(window: Tensor, column: Tensor, line: Tensor, mode: Interpolation) -> Tensor:
-    height, width, channels = window.shape
+def _grid_sample(windows: Sequence[Tensor], column: Tensor, line: Tensor, mode: Interpolation) -> Sequence[Tensor]:
+    (height, width), channels = windows[0].shape[:2], [window.shape[2] for window in windows]
     # With a power of two of intervals, grid_sample's way from a normalised position back to pixels rounds nothing.
-    intervals = [2 ** math.ceil(math.log2(size - 1)) for size in (height, width)]
-    # What lies beyond the window is never looked at, and need not be filled.
-    source = column.new_empty(channels, intervals[0] + 1, intervals[1] + 1)
-    source[:, :height, :width] = window.movedim(-1, 0)
-    grid = torch.stack(
-        [
-            position.mul_(2 / (_PARTS * size)).sub_(1)
-            for position, size in zip((column, line), intervals[::-1], strict=True)
-        ],
-        -1,
-    )
+    intervals = [2 ** math.ceil(math.log2(size - 1)) for size in (width, height)]
+    # What lies beyond the windows is never looked at, and need not be filled.
+    source = column.new_empty(sum(channels), intervals[1] + 1, intervals[0] + 1)
+    for part, window in zip(source.split(channels), windows, strict=True):
+        part[:, :height, :width] = window.movedim(-1, 0)
+    axes = [at.mul_(2 / (_PARTS * size)).sub_(1) for at, size in zip((column, line), intervals, strict=True)]
+    grid = torch.stack(axes, dim=-1)
     sampled = F.grid_sample(source[None], grid[None], mode=mode, padding_mode="border", align_corners=True)
-    return sampled[0].movedim(0, -1)
+    return sampled[0].movedim(0, -1).split(channels, dim=-1)
 
 
-def _remap(window: Tensor, column: Tensor, line: Tensor, mode: Interpolation) -> Tensor:
+def _remap(windows: Sequence[Tensor], column: Tensor, line: Tensor, mode: Interpolation) -> Sequence[Tensor]:
     across, along = (position.div_(_PARTS).numpy() for position in (column, line))
-    sampled = cv2.remap(window.numpy(), across, along, _CV2_MODES[mode], borderMode=cv2.BORDER_REPLICATE)
-    return torch.from_numpy(sampled).reshape(*column.shape, window.shape[2])
+    remapped = [
+        cv2.remap(window.numpy(), across, along, _CV2_MODES[mode], borderMode=cv2.BORDER_REPLICATE)
+        for window in windows
+    ]
+    return [torch.from_numpy(image).reshape(*column.shape, -1) for image in remapped]

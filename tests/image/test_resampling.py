@@ -1,9 +1,11 @@
 """Sampling strips: exact on the grid, right between, the same for any number of threads and any strip."""
 
+import math
+
 import pytest
 import torch
 
-from lsvision.image.resampling import sample_image
+from lsvision.image.resampling import sample_image, sample_images, sampling_reach
 
 
 def positions(lines: int, width: int) -> tuple[torch.Tensor, torch.Tensor]:
@@ -78,3 +80,50 @@ def test_strip_around_a_position_changes_no_bit(mode):
     for start, stop in ((100, 200), (3, 261), (107, 194)):
         part = sample_image(image[start:stop], column, line - start, mode)
         assert torch.equal(part.int(), whole.int())
+
+
+@pytest.mark.parametrize("resampler", ["grid_sample", "opencv"])
+@pytest.mark.parametrize("mode", ["bilinear", "bicubic"])
+def test_several_images_at_once_equal_each_alone(mode, resampler):
+    color, depth = torch.randint(0, 256, (50, 60, 3)).to(torch.uint8), 800 + torch.randn(50, 60, 1)
+    column, line = 59 * torch.rand(37, 41).double(), 49 * torch.rand(37, 41).double()
+    column[torch.rand(37, 41) < 0.2] = torch.nan
+    both = sample_images((color, depth), column, line, mode, resampler=resampler)
+    for image, sampled in zip((color, depth), both, strict=True):
+        assert torch.equal(sampled, sample_image(image, column, line, mode, resampler=resampler))
+
+
+@pytest.mark.parametrize("mode", ["bilinear", "bicubic"])
+@pytest.mark.parametrize("coarser", [(1.0, 1.0), (2.5, 1.5)])
+def test_opencv_agrees(mode, coarser):
+    color, height = torch.randint(0, 256, (50, 60, 3)).to(torch.uint8), 10 * torch.randn(50, 60, 1)
+    column, line = -3 + 66 * torch.rand(37, 41).double(), -3 + 56 * torch.rand(37, 41).double()
+    column[torch.rand(37, 41) < 0.2] = torch.nan
+    ours, theirs = (
+        sample_images((color, height), column, line, mode, coarser=coarser, resampler=resampler)
+        for resampler in ("grid_sample", "opencv")
+    )
+    assert (ours[0].int() - theirs[0].int()).abs().max() <= 1
+    assert (ours[1] - theirs[1]).abs().max() <= 1e-4
+
+
+def test_smoothing_by_hand():
+    # A single bright column, samples three columns apart: a Gaussian of sqrt(8) / 2 px, cut off at 3 sigma.
+    image = torch.zeros(9, 31, 1)
+    image[:, 15] = 1000.0
+    column, line = torch.arange(31).double()[None], torch.full((1, 31), 4.0).double()
+    sampled = sample_image(image, column, line, "bilinear", coarser=(1.0, 3.0)).flatten()
+    assert sampling_reach(3.0) == 2 + 5
+    weights = [math.exp(-0.5 * (k / math.sqrt(2)) ** 2) for k in range(-5, 6)]
+    expected = torch.zeros(31)
+    expected[10:21] = 1000 * torch.tensor(weights) / sum(weights)
+    torch.testing.assert_close(sampled, expected, rtol=1e-5, atol=1e-3)
+    torch.testing.assert_close(
+        sample_image(image + 7, column, line, "bilinear", coarser=(4.0, 3.0)), sampled[None, :, None] + 7
+    )
+
+
+def test_positions_too_far_apart_are_refused():
+    image = torch.zeros(2, 9000, 1)
+    with pytest.raises(ValueError, match="spread of at most 8192 px, got 9003"):
+        sample_image(image, torch.tensor([[0.0, 8998.0]]).double(), torch.zeros(1, 2).double(), "bilinear")

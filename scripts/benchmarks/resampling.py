@@ -1,0 +1,210 @@
+"""Correction of full-width scans against OpenCV, in one run on one machine, on as many threads as torch takes.
+
+Colour and height of a surface in motion are resampled by ``sample_images`` and, with the same maps, by a bare
+``cv2.remap``; both in strips, from one scan to product rows. The correction that makes those maps is timed too, and so
+is a copy of as many bytes as colour and height hold. Memory is that of a process of its own for each length.
+"""
+
+import json
+import resource
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+
+from lsvision.image.resampling import Interpolation, Resampler, sample_images
+from lsvision.image.tiling import in_parallel, keep_freed_memory, tiles
+from lsvision.stages.correction import CorrectionConfig, correct_rows, correct_scan, plan_product
+from lsvision.stages.disparity import DisparityConfig, MatchedDepth
+from lsvision.types import Motion, Rig, Scan, TensorImage, Travel
+
+RIG = Rig(7142, 10.0, 113.84, 354.0, 1042.0, 6099.0)
+PITCH = 0.07
+LINES, MEMORY_LINES = 8192, (8192, 32768, 131072)
+STRIP = 512
+TURNS = 3
+MOTION = Motion(torch.tensor([-0.03, 1.02, 0.02], dtype=torch.float64), torch.zeros(3, 3, dtype=torch.float64))
+CONFIG = CorrectionConfig(height_range_mm=(-30.0, 30.0), strip_rows=STRIP)
+
+
+@dataclass(frozen=True)
+class Repeated:
+    """A tall image that shows the same lines again and again, made where it is read."""
+
+    lines: Tensor
+    height: int
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        return self.height, *self.lines.shape[1:]
+
+    @property
+    def dtype(self) -> torch.dtype:
+        return self.lines.dtype
+
+    def read(self, start: int, stop: int) -> Tensor:
+        return self.lines[torch.arange(start, stop) % len(self.lines)]
+
+
+def surface_scan(lines: int) -> Scan:
+    """A wavy sheet with a raised block and missing depths: as a camera with a matcher of its own delivers it."""
+    generator = torch.Generator().manual_seed(0)
+    u, v = torch.arange(RIG.width_px), torch.arange(1024)[:, None]
+    noise = torch.randn(1024, RIG.width_px, generator=generator)
+    depth = 797.0 + 5 * torch.sin(v * (2 * torch.pi / 1024)) + 0.003 * u + 0.02 * noise
+    depth[:, 2500:4500] -= 20.0
+    depth[:, 300:360] = torch.nan
+    color = torch.randint(0, 256, (1024, RIG.width_px, 3), dtype=torch.uint8, generator=generator)
+    return Scan(Path("made"), RIG, Travel(PITCH), Repeated(color, lines), None, Repeated(depth[..., None], lines))
+
+
+def run() -> dict[str, object]:
+    """Mpx/s of both, their ratios, and megabytes at three lengths; ``ratio`` is that of bicubic colour and height."""
+    keep_freed_memory()
+    ours, bare, largest = resampling_speeds()
+    ratios = {name: round(ours[name] / bare[name.split()[0]], 2) for name in ours}
+    correction, one_pass = scan_speeds()
+    return {
+        "unit": "Mpx/s of the product",
+        "resampling": {name: round(value, 1) for name, value in ours.items()},
+        "cv2.remap": {name: round(value, 1) for name, value in bare.items()},
+        "memcpy": round(memcpy_speed(), 1),
+        "ratios": ratios,
+        "ratio": ratios["bicubic grid_sample"],
+        "largest_difference": largest,
+        "correction_of_a_depth_map_scan": round(depth_map_speed(), 2),
+        "correction_of_a_stereo_scan": round(correction, 2),
+        "one_pass_sgbm_and_remap": round(one_pass, 2),
+        "stereo_ratio": round(correction / one_pass, 2),
+        "megabytes": {str(lines): peak_megabytes(lines) for lines in MEMORY_LINES},
+    }
+
+
+def resampling_speeds() -> tuple[dict[str, float], dict[str, float], dict[str, float]]:
+    """Ours by interpolation and library, bare ``cv2.remap`` by interpolation, and the largest differences of both."""
+    scan = surface_scan(2048)
+    grid = plan_product(scan, MOTION, CONFIG)
+    strip = correct_rows(scan, scan.depth, MOTION, CONFIG, grid, (768, 768 + STRIP))
+    source = strip.source
+    start = int(source[..., 0].nan_to_num(nan=1e9).min()) - 4
+    stop = int(source[..., 0].nan_to_num(nan=0.0).max()) + 5
+    line, column = source[..., 0] - start, source[..., 1].contiguous()
+    filled = [values.nan_to_num(nan=8.0).numpy() for values in (column, line)]  # the peer knows no holes
+    color, depth = scan.left.read(start, stop), scan.depth.read(start, stop).nan_to_num(nan=797.0)
+
+    def ours(mode: Interpolation, resampler: Resampler) -> tuple[Tensor, Tensor]:
+        made = torch.empty(*line.shape, 3, dtype=torch.uint8), torch.empty(*line.shape, 1)
+
+        def fill(tile: tuple[slice, slice]) -> None:
+            parts = sample_images((color, depth), column[tile], line[tile], mode, resampler=resampler)
+            made[0][tile], made[1][tile] = parts
+
+        in_parallel(fill, tiles(*line.shape))
+        return made
+
+    def bare(mode: Interpolation) -> tuple[Tensor, Tensor]:
+        flag = {"bilinear": cv2.INTER_LINEAR, "bicubic": cv2.INTER_CUBIC}[mode]
+        sampled = cv2.remap(color.numpy(), *filled, flag, borderMode=cv2.BORDER_REPLICATE)
+        height = cv2.remap(depth.numpy(), *filled, flag, borderMode=cv2.BORDER_REPLICATE)
+        return torch.from_numpy(sampled), torch.from_numpy(height)[..., None]
+
+    modes: tuple[Interpolation, ...] = ("bilinear", "bicubic")
+    resamplers: tuple[Resampler, ...] = ("grid_sample", "opencv")
+    sides: dict[str, Callable[[], tuple[Tensor, Tensor]]] = {mode: lambda mode=mode: bare(mode) for mode in modes}
+    sides |= {
+        f"{mode} {with_}": lambda mode=mode, with_=with_: ours(mode, with_) for mode in modes for with_ in resamplers
+    }
+    speeds = {name: line.numel() / seconds / 1e6 for name, seconds in median_seconds(sides).items()}
+    expected = bare("bilinear")
+    found = ours("bilinear", "grid_sample")
+    known = torch.isfinite(source[..., 0])
+    largest = {
+        "grey values": float((found[0].int() - expected[0].int())[known].abs().max()),
+        "mm": float((found[1] - expected[1])[known].abs().max()),
+    }
+    return {name: speeds[name] for name in speeds if " " in name}, {mode: speeds[mode] for mode in modes}, largest
+
+
+def depth_map_speed() -> float:
+    """Mpx/s of the whole correction of a depth-map scan, without files."""
+    scan = surface_scan(LINES)
+    grid = plan_product(scan, MOTION, CONFIG)
+    begin = time.perf_counter()
+    for _ in correct_scan(scan, scan.depth, MOTION, CONFIG, grid):
+        pass
+    return grid.rows * grid.columns / (time.perf_counter() - begin) / 1e6
+
+
+def scan_speeds() -> tuple[float, float]:
+    """Mpx/s of correcting a stereo scan, matched from coarse to fine, and of one-pass SGBM with ``cv2.remap``."""
+    generator = torch.Generator().manual_seed(0)
+    texture = torch.randint(0, 256, (2 * STRIP, RIG.width_px + 200, 3), dtype=torch.uint8, generator=generator)
+    texture = torch.from_numpy(cv2.GaussianBlur(texture.numpy(), (0, 0), 1.5))
+    left, right = TensorImage(texture[:, 100:-100].contiguous()), TensorImage(texture[:, 80:-120].contiguous())
+    scan = Scan(Path("made"), RIG, Travel(PITCH), left, right, None)
+    grid = plan_product(scan, MOTION, CONFIG)
+    fine = replace(
+        DisparityConfig(), matcher="coarse_to_fine", refine_iterations=1, largest_sigma_px=0.5, halo_lines=48
+    )
+    maps = [np.ascontiguousarray(values) for values in np.meshgrid(np.arange(7142.0), np.arange(2.0 * STRIP))]
+    maps = [values.astype(np.float32) + 0.3 for values in maps]
+
+    def ours() -> None:
+        for _ in correct_scan(scan, MatchedDepth(scan, fine), MOTION, CONFIG, grid):
+            pass
+
+    def one_pass() -> None:
+        depth = MatchedDepth(scan, replace(DisparityConfig(), refine_iterations=0)).read(0, scan.lines)
+        cv2.remap(left.tensor.numpy(), *maps, cv2.INTER_CUBIC)
+        cv2.remap(depth.numpy(), *maps, cv2.INTER_LINEAR)
+
+    seconds = median_seconds({"ours": ours, "one pass": one_pass}, turns=1)
+    cells = scan.lines * RIG.width_px
+    return cells / seconds["ours"] / 1e6, cells / seconds["one pass"] / 1e6
+
+
+def memcpy_speed() -> float:
+    """Mpx/s of copying colour and height, seven bytes a pixel."""
+    source = torch.zeros(7 * STRIP * RIG.width_px, dtype=torch.uint8)
+    target = torch.empty_like(source)
+    seconds = median_seconds({"copy": lambda: target.copy_(source)})["copy"]
+    return STRIP * RIG.width_px / seconds / 1e6
+
+
+def median_seconds(sides: dict[str, Callable[[], object]], turns: int = TURNS) -> dict[str, float]:
+    """Median time of each side; the sides take turns, so that a slow moment of the machine meets all of them."""
+    taken: dict[str, list[float]] = {name: [] for name in sides}
+    for turn in range(turns + 1):
+        for name, side in sides.items():
+            begin = time.perf_counter()
+            side()
+            if turn > 0 or turns == 1:
+                taken[name].append(time.perf_counter() - begin)
+    return {name: statistics.median(values) for name, values in taken.items()}
+
+
+def peak_megabytes(lines: int) -> int:
+    """Peak memory of a process that corrects a depth-map scan of a number of lines; the strips in between are left out.
+
+    Only the first and the last strips of the longer scans are computed: the memory is that of a strip.
+    """
+    code = f"import resampling; resampling.correct_and_report({lines})"
+    folder = str(Path(__file__).parent)
+    result = subprocess.run([sys.executable, "-c", code], cwd=folder, capture_output=True, text=True, check=True)
+    return int(json.loads(result.stdout.splitlines()[-1]))
+
+
+def correct_and_report(lines: int) -> None:
+    """Correct a scan and print the megabytes that it took."""
+    scan = surface_scan(lines)
+    for _ in correct_scan(scan, scan.depth, MOTION, CONFIG):
+        pass
+    print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024)
