@@ -41,7 +41,7 @@ class DaskEngine:
         self._tasks: dict[Future, Task] = {}
         self._settings = dask.config.set(_SETTINGS)
         logging.getLogger("distributed").setLevel(logging.CRITICAL)  # what matters of it is in the results
-        self._cluster = None
+        self._cluster, self._workers = None, workers
         if scheduler is None:
             self._cluster = LocalCluster(
                 n_workers=workers,
@@ -94,6 +94,8 @@ class DaskEngine:
             if self._client.status != "running":
                 raise _lost()
             self._threads = self._count_threads()
+            if self._cluster is not None and self._threads < self._workers:
+                self._cluster.scale(self._workers)  # one that died while it started is not replaced by itself
             with suppress(Empty):
                 return [self._take(self._done.get(timeout=_LOOK_SECONDS))]
 

@@ -5,6 +5,7 @@ import multiprocessing
 import os
 import signal
 import threading
+from collections import deque
 from collections.abc import Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
@@ -13,9 +14,11 @@ from types import TracebackType
 from typing import Literal, Protocol
 
 from lsvision.archive.tasks import Task, TaskResult, run_task
+from lsvision.errors import LsvisionError
 
 # A strip that ended this many workers is given up.
-MOST_DEATHS = 2
+MOST_DEATHS = 3
+MOST_FAILED_STARTS = 10
 
 log = logging.getLogger(__name__)
 
@@ -71,17 +74,22 @@ def worker_count(config: EngineConfig) -> int:
 class LocalEngine:
     """Worker processes on this machine.
 
-    Each worker is a pool of its own, so that when one dies it is known which task it was at: that one is given to a
-    new worker, once.
+    Each worker is a pool of its own, so that when one dies it is known which task it was at: the next worker that is
+    free takes that up. A worker gets its first task when it has started, so that no task answers for a failed start.
     """
 
     def __init__(self, workers: int) -> None:
         self._context = multiprocessing.get_context("forkserver")
         self._context.set_forkserver_preload(["__main__", "lsvision.archive.tasks"])
-        self._idle = [self._new_worker() for _ in range(workers)]
-        self._busy: dict[Future[TaskResult], tuple[Task, ProcessPoolExecutor]] = {}
-        self._deaths: dict[Task, int] = {}
         self._workers = workers
+        self._waiting: deque[Task] = deque()
+        self._deaths: dict[Task, int] = {}
+        self._idle: list[ProcessPoolExecutor] = []
+        # What every other worker is at: a task, or its start where that is None.
+        self._busy: dict[Future, tuple[Task | None, ProcessPoolExecutor]] = {}
+        self._failed_starts = 0
+        for _ in range(workers):
+            self._start_worker()
 
     def __enter__(self) -> "LocalEngine":
         return self
@@ -98,49 +106,72 @@ class LocalEngine:
         return self._workers
 
     def submit(self, task: Task) -> None:
-        """Give a task to an idle worker."""
-        pool = self._idle.pop()
-        try:
-            future = pool.submit(run_task, task)
-        except BrokenProcessPool:  # killed while it had nothing to do
-            pool.shutdown(wait=False)
-            pool = self._new_worker()
-            future = pool.submit(run_task, task)
-        self._busy[future] = task, pool
+        """Take a task for the next worker that is free."""
+        self._waiting.append(task)
+        self._hand_out()
 
     def collect(self) -> list[Finished]:
-        """Wait for a worker; the task of one that died is tried once more."""
+        """Wait for a worker to be done with a task.
+
+        Raises:
+            LsvisionError: workers do not start.
+        """
         while True:
             ready, _ = wait(self._busy, return_when=FIRST_COMPLETED)
             finished = [item for future in ready if (item := self._take(future)) is not None]
+            self._hand_out()
             if finished:
                 return finished
 
-    def _take(self, future: Future[TaskResult]) -> Finished | None:
+    def _hand_out(self) -> None:
+        while self._waiting and self._idle:
+            pool = self._idle.pop()
+            try:
+                future = pool.submit(run_task, self._waiting[0])
+            except BrokenProcessPool:  # killed while it had nothing to do
+                self._replace(pool)
+                continue
+            self._busy[future] = self._waiting.popleft(), pool
+
+    def _take(self, future: Future) -> Finished | None:
         task, pool = self._busy.pop(future)
         try:
             result = future.result()
         except BrokenProcessPool:
-            pool.shutdown(wait=False)
-            self._idle.append(self._new_worker())
+            self._replace(pool)
             return self._after_death(task)
         self._idle.append(pool)
+        if task is None:
+            self._failed_starts = 0
+            return None
         self._deaths.pop(task, None)
         return task, result
 
-    def _after_death(self, task: Task) -> Finished | None:
+    def _after_death(self, task: Task | None) -> Finished | None:
+        if task is None:
+            self._failed_starts += 1
+            if self._failed_starts > MOST_FAILED_STARTS:
+                raise LsvisionError(
+                    f"workers do not start: {self._failed_starts} of them ended before their first task"
+                )
+            return None
         self._deaths[task] = self._deaths.get(task, 0) + 1
         if self._deaths[task] >= MOST_DEATHS:
             return task, TaskResult(error=f"{MOST_DEATHS} workers died at it, of memory or a signal")
-        log.warning("a worker died at %s of %s; another takes it up", task.stage or "a step", task.scan)
-        self.submit(task)
+        log.warning("a worker died at %s %d of %s; another takes it up", task.stage or "step", task.number, task.scan)
+        self._waiting.appendleft(task)
         return None
 
-    def _new_worker(self) -> ProcessPoolExecutor:
-        return ProcessPoolExecutor(1, mp_context=self._context, initializer=_start_worker)
+    def _replace(self, pool: ProcessPoolExecutor) -> None:
+        pool.shutdown(wait=False)
+        self._start_worker()
+
+    def _start_worker(self) -> None:
+        pool = ProcessPoolExecutor(1, mp_context=self._context, initializer=_enter_worker)
+        self._busy[pool.submit(os.getpid)] = None, pool
 
 
-def _start_worker() -> None:
+def _enter_worker() -> None:
     """Workers end with the run, however that ends, and leave Ctrl-C to it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
