@@ -5,18 +5,21 @@
 
 import logging
 import sys
+from functools import partial
 from pathlib import Path
 from typing import Any, cast
 
 import hydra
 import torch
 from hydra.core.hydra_config import HydraConfig
+from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from lsvision.errors import ConfigError, LsvisionError
 from lsvision.experiments import EXPERIMENTS
 from lsvision.experiments.settings import build_settings
+from lsvision.experiments.sweep import run_job
 
 log = logging.getLogger("lsvision")
 
@@ -45,18 +48,29 @@ def _run(config: DictConfig) -> None:
 
 @hydra.main(version_base="1.3", config_path=str(config_folder()), config_name="config")
 def main(config: DictConfig) -> None:
-    """Run the experiment that the configuration names; an expected failure is one line and its exit code."""
+    """Run the experiment that the configuration names; an expected failure is one line and its exit code.
+
+    A job of a sweep writes its failure down instead, and the others go on.
+    """
+    hydra_config = HydraConfig.get()
+    if hydra_config.mode == RunMode.MULTIRUN:
+        folder = Path(hydra_config.runtime.output_dir)
+        failure = run_job(partial(_run, config), folder, list(hydra_config.overrides.task))
+        if failure is not None:
+            _log_trace_to_file(failure)
+        return
     try:
         _run(config)
     except LsvisionError as error:
-        _log_trace_to_file()
+        _log_trace_to_file(error)
         print(f"error: {error}", file=sys.stderr)
         raise SystemExit(error.exit_code) from None
 
 
-def _log_trace_to_file() -> None:
-    """Write the current exception's trace to the run's log file, past the console."""
-    record = logging.LogRecord("lsvision", logging.ERROR, __file__, 0, "failed", None, sys.exc_info())
+def _log_trace_to_file(error: Exception) -> None:
+    """Write an exception's trace to the run's log file, past the console."""
+    trace = (type(error), error, error.__traceback__)
+    record = logging.LogRecord("lsvision", logging.ERROR, __file__, 0, "failed", None, trace)
     for handler in logging.getLogger().handlers:
         if isinstance(handler, logging.FileHandler):
             handler.handle(record)

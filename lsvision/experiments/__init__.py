@@ -11,6 +11,7 @@ from lsvision.experiments.reprocess import ReprocessSettings, StatusSettings, ru
 from lsvision.experiments.settings import RunSettings
 from lsvision.experiments.simulate import SimulateSettings, run_simulate
 from lsvision.experiments.study import StudySettings, run_study
+from lsvision.experiments.sweep import CollectSettings, run_collect
 from lsvision.experiments.validate import ValidateSettings, run_validate
 
 # By name: the function and the schema of its options.
@@ -23,4 +24,5 @@ EXPERIMENTS: dict[str, tuple[Callable[[Any, Path], None], type[RunSettings]]] = 
     "status": (run_status, StatusSettings),
     "validate": (run_validate, ValidateSettings),
     "study": (run_study, StudySettings),
+    "collect": (run_collect, CollectSettings),
 }

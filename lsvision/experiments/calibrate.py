@@ -1,5 +1,6 @@
 """``+experiment=calibrate``: boards' scans -> corners -> calibration.json and a report."""
 
+import json
 import logging
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
@@ -9,11 +10,11 @@ from lsvision import __version__
 from lsvision.errors import CalibrationError, ConfigError
 from lsvision.experiments.progress import progress_bars
 from lsvision.experiments.settings import RunSettings, settings_sha256
-from lsvision.io import read_scan, scan_sha256, write_calibration
+from lsvision.io import read_scan, scan_sha256, write_calibration, write_text
 from lsvision.report import calibration_report, calibration_summary
 from lsvision.stages.calibration import CalibrationConfig, calibrate
 from lsvision.stages.corners import CornersConfig, find_corners
-from lsvision.types import Board, BoardCorners, Provenance, Scan
+from lsvision.types import Board, BoardCorners, Calibration, Provenance, Scan
 
 log = logging.getLogger(__name__)
 
@@ -42,6 +43,7 @@ def run_calibrate(settings: CalibrateSettings, folder: Path) -> None:
     calibration = replace(calibration, provenance=provenance)
     target = Path(settings.output) if settings.output else folder / "calibration.json"
     write_calibration(calibration, target)
+    write_text(folder / "summary.json", json.dumps(_summary(calibration), indent=2) + "\n")
     calibration_report(calibration, boards, asdict(settings), folder)
     log.info("%s\nwrote %s and %s", calibration_summary(calibration), target, folder / "report.html")
 
@@ -71,3 +73,20 @@ def find_boards(scans: Sequence[Scan], board: Board, config: CornersConfig) -> l
             found.append(find_corners(scan, board, config))
             bars.advance(bar)
     return found
+
+
+def _summary(calibration: Calibration) -> dict:
+    """The figures by which calibrations are compared; ``calibration.json`` has all."""
+    return {
+        "method": calibration.method,
+        "boards": len(calibration.boards),
+        "verdict": calibration.observability.verdict,
+        "n": calibration.motion.n.tolist(),
+        "sigma": calibration.motion.sigma.tolist(),
+        "stretch": calibration.motion.stretch,
+        "rmse_before_mm": calibration.rmse_before_mm,
+        "rmse_after_mm": calibration.rmse_after_mm,
+        "improvement": calibration.improvement,
+        "iterations": len(calibration.iterations) - 1,
+        "converged": calibration.converged,
+    }

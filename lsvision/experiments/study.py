@@ -79,11 +79,12 @@ def run_study(settings: StudySettings, folder: Path) -> None:
 
 
 def _summary(study: Study) -> dict:
-    """Plain values: the study's size, and each point's conditions that vary with its figures of merit."""
+    """Plain values: the study's size, the medians of its figures of merit, and those of each point."""
     merits = ("rms_n1", "rms_n2", "rms_n3", "error_over_bound", "nees", "rmse_after_mm", "converged", "prior_dominated")
     return {
         "points": len(study.points),
         "calibrations": len(study.runs),
+        "median": study.points.select(polars.col(merits).median()).row(0, named=True),
         "results": study.points.select(*study.axes, *merits).to_dicts(),
     }
 

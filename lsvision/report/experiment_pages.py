@@ -15,9 +15,11 @@ from lsvision.report.calibration_figures import (
 )
 from lsvision.report.pages import Comparison, ReportFigure, Table, write_report
 from lsvision.report.product_figures import product_images
+from lsvision.report.space_figures import corners_in_space, surface_in_space
 from lsvision.report.summary import calibration_summary
 from lsvision.types import BoardCorners, Calibration
 
+_PROVENANCE = ("scan", "calibration", "config_sha256")  # of a product's metadata
 _SHOWN_ROWS = 4000  # of a product, from its start: enough for a look, little enough for any length of scan
 
 
@@ -48,12 +50,17 @@ def calibration_report(calibration: Calibration, boards: Sequence[BoardCorners],
             components_by_iteration(curves),
             stretch_by_iteration(curves),
             observability_bars(calibration),
+            corners_in_space(boards, calibration),
             *(
                 corner_positions(board, calibration, name=f"corner_positions_{index}", label=Path(board.scan).name)
                 for index, board in enumerate(boards, start=1)
             ),
         ],
         settings=settings,
+        provenance={
+            "configuration": f"sha256 {calibration.provenance.config_sha256}",
+            **{path: f"sha256 {digest}" for path, digest in calibration.provenance.scans},
+        },
     )  # fmt: skip
 
 
@@ -66,7 +73,8 @@ def product_report(product: Product, valid_share: float, settings: dict, folder:
     figures: list[ReportFigure] = [
         product_images(
             "product", "Colour and height", product.color(0, rows), height, product.pitch_mm, product.origin_mm
-        )
+        ),
+        surface_in_space("surface", height, product.pitch_mm, product.origin_mm),
     ]
     write_report(
         folder,
@@ -80,4 +88,5 @@ def product_report(product: Product, valid_share: float, settings: dict, folder:
         tables=[],
         figures=figures,
         settings=settings,
+        provenance={key: str(product.metadata[key]) for key in _PROVENANCE if key in product.metadata},
     )

@@ -1,24 +1,26 @@
 """The HTML report: one file that needs nothing else, with its figures beside it as PNG and SVG."""
 
-import base64
-import io
-from collections.abc import Sequence
+import platform
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import torch
 import yaml
 from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
 from matplotlib.figure import Figure
 
 from lsvision import __version__
 from lsvision.io import write_text
-
-_DPI = 110
+from lsvision.report.embedding import Embedded, embed
 
 
 @dataclass(frozen=True)
 class ReportFigure:
-    """A figure with its file name, title and a caption that says what to see."""
+    """A figure with its file name, title and a caption that says what to see.
+
+    Axes in three dimensions are embedded as views from all round, to be turned in the page.
+    """
 
     name: str
     title: str
@@ -28,12 +30,13 @@ class ReportFigure:
 
 @dataclass(frozen=True)
 class Table:
-    """A table of a report; cells are shown as they are."""
+    """A table of a report; cells are shown as they are, the first of a row as a link where ``links`` has one for it."""
 
     title: str
     header: Sequence[str]
     rows: Sequence[Sequence[str]]
     note: str = ""
+    links: Sequence[str] = ()
 
 
 @dataclass(frozen=True)
@@ -45,6 +48,14 @@ class Comparison:
     against: str = ""
 
 
+@dataclass(frozen=True)
+class _Shown:
+    """A figure as the page shows it."""
+
+    item: ReportFigure
+    embedded: Embedded
+
+
 def write_report(
     folder: Path,
     *,
@@ -54,21 +65,18 @@ def write_report(
     tables: Sequence[Table],
     figures: Sequence[ReportFigure],
     settings: dict,
+    provenance: Mapping[str, str] | None = None,
 ) -> None:
     """Write ``report.html`` and ``figures/*.png, *.svg`` into a run's folder.
 
     Args:
         lead: one paragraph that says what was done and what came out.
         settings: the resolved configuration, shown at the end.
+        provenance: what the results were made from, by name, beside the versions that made them.
     """
     pictures = folder / "figures"
     pictures.mkdir(parents=True, exist_ok=True)
-    shown = []
-    for item in figures:
-        png = _saved(item.figure, "png")
-        (pictures / f"{item.name}.png").write_bytes(png)
-        (pictures / f"{item.name}.svg").write_bytes(_saved(item.figure, "svg"))
-        shown.append({"item": item, "data": base64.b64encode(png).decode()})
+    shown = [_Shown(item, embed(item.figure, pictures / item.name)) for item in figures]
     environment = Environment(
         loader=PackageLoader("lsvision.report"),
         autoescape=select_autoescape(["html", "j2"]),
@@ -83,12 +91,15 @@ def write_report(
         tables=tables,
         figures=shown,
         settings=yaml.safe_dump(settings, sort_keys=False, allow_unicode=True),
-        version=__version__,
+        provenance={**(provenance or {}), **_versions()},
     )
     write_text(folder / "report.html", page)
 
 
-def _saved(figure: Figure, kind: str) -> bytes:
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format=kind, dpi=_DPI, metadata={"Date": None} if kind == "svg" else None)
-    return buffer.getvalue()
+def _versions() -> dict[str, str]:
+    return {
+        "lsvision": __version__,
+        "torch": str(torch.__version__),
+        "Python": platform.python_version(),
+        "machine": f"{platform.system()} {platform.machine()}",
+    }

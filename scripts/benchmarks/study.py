@@ -1,8 +1,8 @@
 """Calibrations of three boards of 88 corners: a study's batches against a loop over scipy.optimize.least_squares.
 
 Both start from the best fits of the boards under the nominal motion, estimate the same 21 unknowns from the same noisy
-corners under the same prior, and give n with its covariance. The study uses two threads, as it does by default; the loop
-cannot. scipy gets a residual vectorised in numpy and its own defaults: trust region, derivatives by differences.
+corners under the same prior, and give n with its covariance. The study uses two threads, as it does by default; the
+loop cannot. scipy gets a residual vectorised in numpy and its own defaults: trust region, derivatives by differences.
 """
 
 import statistics

@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from mpl_toolkits.mplot3d import Axes3D
 
 from lsvision.report.calibration_figures import (
     components_by_iteration,
@@ -13,7 +14,9 @@ from lsvision.report.calibration_figures import (
     stretch_by_iteration,
 )
 from lsvision.report.drawing import new_figure, show_image, thinned
+from lsvision.report.embedding import embed
 from lsvision.report.product_figures import height_profile, product_images, sheet_correspondences
+from lsvision.report.space_figures import corners_in_space, surface_in_space
 
 # Counts and directions have no unit.
 UNITLESS = ("iteration", "direction of n")
@@ -37,6 +40,9 @@ def figures(determined, dominated, corners):
         corners_on_images((image, points), (image, points), 0.07),
         product_images("product", "Colour and height", image, height, 0.5, (10.0, -20.0)),
         height_profile("profile", "Profile", height, 0.5, -20.0),
+        corners_in_space([corners, corners], determined),
+        surface_in_space("surface", height, 0.5, (10.0, -20.0)),
+        surface_in_space("nothing", torch.full((4, 5), torch.nan), 0.5, (10.0, -20.0)),
         sheet_correspondences((points, moved), (points, points), (image, image), 0.5),
     ]
 
@@ -53,7 +59,8 @@ def test_every_figure_says_what_it_shows(figures):
                 continue
             assert axes.get_title()
             shares_y = bool(axes.get_shared_y_axes().get_siblings(axes)[1:])
-            for label in (axes.get_xlabel(), axes.get_ylabel()):
+            solid = [axes.get_zlabel()] if isinstance(axes, Axes3D) else []
+            for label in (axes.get_xlabel(), axes.get_ylabel(), *solid):
                 unit = "[" in label and "]" in label
                 assert unit or label.startswith(UNITLESS) or (label == "" and shares_y), (item.name, label)
 
@@ -97,3 +104,34 @@ def test_previews_are_thin_and_eight_bit():
     image = torch.tensor([[[65535], [256]]]).to(torch.uint16)
     shown = show_image(axes, image, (0, 2, 1, 0))
     assert shown.get_array().tolist() == [[255, 1]]
+
+
+def test_surface_lies_where_its_cells_are():
+    height = torch.arange(12.0).reshape(3, 4)
+    axes = surface_in_space("s", height, 0.5, (10.0, -20.0)).figure.axes[0]
+    assert axes.xy_dataLim.min.tolist() == [-20.0, 10.0]
+    assert axes.xy_dataLim.max.tolist() == [-18.5, 11.0]
+    assert axes.zz_dataLim.intervalx.tolist() == [0.0, 11.0]
+
+
+def test_boards_stand_upright_and_fit(corners, determined):
+    # A board 797 mm before the cameras lies at -797 in the figure, whose third axis points towards them.
+    axes = corners_in_space([corners, corners], determined).figure.axes[0]
+    heights = axes.collections[0]._offsets3d[2]
+    assert heights == pytest.approx(-(797.0 + 0.014 * corners.points[:, 1].numpy()))
+
+
+def test_embedded_as_vector_pixels_or_views(tmp_path, figures):
+    by_name = {item.name: item.figure for item in figures}
+    drawing = embed(by_name["rmse_by_iteration"], tmp_path / "drawing")
+    assert drawing.vector
+    assert drawing.uris[0].startswith("data:image/svg+xml;base64,")
+    picture = embed(by_name["product"], tmp_path / "picture")
+    assert not picture.vector
+    assert picture.uris[0].startswith("data:image/png;base64,")
+    solid = embed(by_name["surface"], tmp_path / "solid")
+    assert len(set(solid.uris)) == len(solid.uris) == 18
+    assert all(uri.startswith("data:image/webp;base64,") for uri in solid.uris)
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        f"{name}.{kind}" for name in ("drawing", "picture", "solid") for kind in ("png", "svg")
+    ]

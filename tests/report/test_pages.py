@@ -1,6 +1,7 @@
 """The report: one HTML file that asks for nothing else, its text escaped, its figures beside it."""
 
 import base64
+import dataclasses
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -10,6 +11,7 @@ import torch
 from lsvision.io import ProductLayout, ProductWriter, read_product
 from lsvision.report import Comparison, ReportFigure, Table, calibration_report, product_report, write_report
 from lsvision.report.drawing import label_axes, new_figure
+from lsvision.types import Provenance
 
 NASTY = "<script>alert('x')</script> & \"quotes\""
 
@@ -61,37 +63,54 @@ def test_report_is_complete_and_escaped(tmp_path, figure):
         tables=[Table("Boards", ("scan", "σ [mm]"), [(NASTY, "0.5"), ("Tür", "0.1")], note="a note")],
         figures=[figure],
         settings={"scan": NASTY, "nested": {"list": [1, 2]}, "path": None},
+        provenance={"scans/a": f"sha256 {NASTY}"},
     )
     page = read_page(tmp_path)
     assert page.tags.count("script") == 1  # the page's own
     for piece in (f"title {NASTY}", f"lead {NASTY}", f"1 {NASTY}", f"caption {NASTY}", "σ [mm]", "Tür", "a note"):
         assert piece in page.text
-    assert page.tags.count("tr") == 3
+    assert f"sha256 {NASTY}" in page.text
+    assert page.tags.count("tr") == 3 + 5  # the table's, and what it was made from
     assert "nested:" in page.text
     png, svg = tmp_path / "figures" / "line.png", tmp_path / "figures" / "line.svg"
     assert png.read_bytes().startswith(b"\x89PNG")
     assert "<svg" in svg.read_text(encoding="utf-8")
-    (picture,) = [r for r in page.references if r.startswith("data:image/png;base64,")]
-    assert base64.b64decode(picture.split(",", 1)[1]) == png.read_bytes()
+    (picture,) = [r for r in page.references if r.startswith("data:image/svg+xml;base64,")]
+    assert base64.b64decode(picture.split(",", 1)[1]) == svg.read_bytes()
+
+
+def test_rows_lead_to_pages_beside_it(tmp_path):
+    table = Table("Jobs", ("job", "n"), [("0", "1"), (NASTY, "2")], links=["0/report.html", "1/report.html"])
+    write_report(tmp_path, title="t", lead="l", headlines=[], tables=[table], figures=[], settings={})
+    page = Page((tmp_path / "report.html").read_text(encoding="utf-8"))
+    assert page.references[1:] == ["0/report.html", "1/report.html"]
+    assert NASTY in page.text
 
 
 def test_report_without_figures_or_tables(tmp_path):
     write_report(tmp_path, title="t", lead="l", headlines=[], tables=[], figures=[], settings={})
     page = read_page(tmp_path)
     assert "img" not in page.tags
-    assert "table" not in page.tags
+    assert page.tags.count("table") == 1  # what it was made from
+    assert "torch" in page.text
 
 
 def test_calibration_report(tmp_path, determined, corners):
-    calibration_report(determined, [corners], {"method": "joint"}, tmp_path)
+    determined = dataclasses.replace(
+        determined, provenance=Provenance("0.1.0", "abc", (("scans/<first>", "def"), ("scans/second", "123")))
+    )
+    calibration_report(determined, [corners, corners], {"method": "joint"}, tmp_path)
     page = read_page(tmp_path)
-    assert page.tags.count("img") == 5
-    assert "Calibration from 1 board scan(s)" in page.text
+    assert page.tags.count("img") == 6 + 18  # six drawings, and the boards from all round
+    assert page.tags.count("input") == 1
+    assert "sha256 abc" in page.text
+    assert "sha256 123" in page.text
+    assert "Calibration from 2 board scan(s)" in page.text
     assert "<first> & last" in page.text
     assert "determined" in page.text
     assert "1.020427" in page.text
     assert "± 4.0e-05 mm per mm" in page.text
-    assert len(list((tmp_path / "figures").glob("*.png"))) == len(list((tmp_path / "figures").glob("*.svg"))) == 5
+    assert len(list((tmp_path / "figures").glob("*.png"))) == len(list((tmp_path / "figures").glob("*.svg"))) == 7
 
 
 @pytest.mark.parametrize("measured", [True, False])
