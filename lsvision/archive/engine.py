@@ -36,7 +36,7 @@ class EngineConfig:
 
     kind: Literal["local", "dask"] = "local"
     workers: int | None = None
-    worker_memory_mb: int = 3072
+    worker_memory_mb: int = 2048
     scheduler: str | None = None
 
 

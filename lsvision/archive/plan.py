@@ -17,9 +17,9 @@ from lsvision.stages.disparity import DisparityConfig, disparity_range
 from lsvision.types import Scan
 
 # Peak of a worker over an idle one, as measured; an idle one holds torch, OpenCV and the decoded ends of its files.
-IDLE_BYTES = 700 * 2**20
-_CORRECTION_BYTES_PER_PX = 400
-_MATCHING_BYTES_PER_PX = 60
+IDLE_BYTES = 500 * 2**20
+_CORRECTION_BYTES_PER_PX = 120
+_MATCHING_BYTES_PER_PX = 120
 _LEAST_ROWS = 32
 
 # Seconds a pixel and stage on one core, until the ledger knows better.

@@ -142,28 +142,11 @@ def cluster(tmp_path) -> Iterator:
             port = free.getsockname()[1]
         address = f"tcp://127.0.0.1:{port}"
         quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "cwd": tmp_path}
-        scheduler = subprocess.Popen(
-            [sys.executable, "-m", "distributed.cli.dask_scheduler", "--host", "127.0.0.1", "--port", str(port),
-             "--no-dashboard"],
-            **quiet,
-        )  # fmt: skip
-        workers = [
-            subprocess.Popen(
-                [
-                    sys.executable,
-                    "-m",
-                    "distributed.cli.dask_worker",
-                    address,
-                    "--nthreads",
-                    "1",
-                    "--no-dashboard",
-                    "--death-timeout",
-                    "5",
-                ],
-                **quiet,
-            )
-            for _ in range(2)
-        ]
+        dask = [sys.executable, "-m", "dask"]
+        own = [*dask, "scheduler", "--host", "127.0.0.1", "--port", str(port), "--no-dashboard"]
+        worker = [*dask, "worker", address, "--nthreads", "1", "--no-dashboard", "--death-timeout", "60"]
+        scheduler = subprocess.Popen(own, **quiet)
+        workers = [subprocess.Popen(worker, **quiet) for _ in range(2)]
         started.extend([scheduler, *workers])
         return address, scheduler
 

@@ -11,19 +11,19 @@ from tests.archive.archives import PROCESSING
 
 
 @pytest.mark.parametrize(
-    ("megabytes", "rows"), [(10_000, 512), (2_000, 512), (1_000, 256), (900, 128), (850, 64), (800, 32)]
+    ("megabytes", "rows"), [(2_000, 512), (650, 512), (600, 256), (560, 128), (540, 64), (530, 32)]
 )
 def test_rows_fit_the_memory(megabytes, rows):
     most = 512
     memory = megabytes * 2**20
     found = rows_for_memory(1786, 100, most, memory)
     assert found == rows
-    assert IDLE_BYTES + (found + 100) * 1786 * 400 <= memory
+    assert IDLE_BYTES + (found + 100) * 1786 * 120 <= memory
 
 
 def test_too_little_memory_says_how_much_it_takes():
-    with pytest.raises(ValueError, match=r"a worker needs 1059 MB for 32 rows of 7142 px, it may take 800 MB"):
-        rows_for_memory(7142, 100, 512, 800 * 2**20)
+    with pytest.raises(ValueError, match=r"a worker needs 607 MB for 32 rows of 7142 px, it may take 600 MB"):
+        rows_for_memory(7142, 100, 512, 600 * 2**20)
 
 
 def test_a_scan_too_wide_for_a_worker_is_faulty(archive, calibration, tmp_path):

@@ -1,0 +1,154 @@
+"""An archive through the engines against the bare stage calls in one loop: lines a second, overhead, memory.
+
+Workers are started and have imported everything before the clock runs; starting them is told apart.
+"""
+
+import resource
+import statistics
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+
+from lsvision.archive import (
+    LEDGER_FILE,
+    Engine,
+    Ledger,
+    LocalEngine,
+    Place,
+    Processing,
+    find_scans,
+    plan_run,
+    read_calibrations,
+    run_jobs,
+    scan_job,
+)
+from lsvision.archive.dask_engine import DaskEngine
+from lsvision.archive.tasks import Task, TaskResult
+from lsvision.io import ProductLayout, ProductWriter, read_calibration, read_scan, write_calibration, write_scan
+from lsvision.stages.correction import CorrectionConfig, correct_scan, plan_product
+from lsvision.stages.disparity import DisparityConfig, depth_of
+from lsvision.types import Calibration, Motion, Observability, Rig, Travel
+
+RIG = Rig(893, 80.0, 113.84, 354.0, 129.8125, 761.9375)
+SCANS, LINES = 2, 2048
+TURNS = 3
+WORKER_MEMORY_MB = 2048
+PROCESSING = Processing(DisparityConfig(strip_lines=256), CorrectionConfig(strip_rows=256), False, WORKER_MEMORY_MB)
+
+
+@dataclass(frozen=True)
+class PeakMemory:
+    """The most memory, in KiB, that the worker which runs it ever took."""
+
+    number: int
+
+    def run(self) -> TaskResult:
+        """Ask the system."""
+        return TaskResult(measured=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
+
+
+def make_archive(root: Path) -> Path:
+    """Scans of a textured plane, a few pixels off the plane of zero disparity; returns the calibration's path."""
+    random = torch.Generator().manual_seed(0)
+    for number in range(SCANS):
+        noise = torch.rand(3, 1, LINES, RIG.width_px, generator=random)
+        texture = torch.nn.functional.avg_pool2d(noise, 3, 1, 1)[:, 0].movedim(0, -1)
+        left = ((texture - 0.5) * 400 + 128).clamp(0, 255).to(torch.uint8)
+        write_scan(
+            root / f"scan{number}", rig=RIG, travel=Travel(0.56), left=[left], right=[left.roll(-4, 1)], lines=LINES
+        )
+    motion = Motion(torch.tensor([0.02, 1.02, -0.01]).double(), 1e-8 * torch.eye(3).double())
+    path = root / "calibration.json"
+    write_calibration(Calibration("joint", motion, 1.0, 0.1, (), (), Observability("determined", (), ""), RIG), path)
+    return path
+
+
+def bare(archive: Path, calibration: Path, output: Path) -> float:
+    """Seconds of the stages themselves, scan after scan, and their product written."""
+    motion, config = read_calibration(calibration).motion, PROCESSING.correction
+    begin = time.perf_counter()
+    for found in find_scans(str(archive)):
+        scan = read_scan(found.path)
+        grid = plan_product(scan, motion, config)
+        layout = ProductLayout(
+            (grid.rows, grid.columns), grid.pitch_mm, (grid.origin_y_mm, grid.origin_x_mm), 3, torch.uint8,
+            config.strip_rows, {},
+        )  # fmt: skip
+        with ProductWriter(output / f"{found.key}.zarr", layout) as writer:
+            for strip in correct_scan(scan, depth_of(scan, PROCESSING.disparity), motion, config, grid):
+                writer.write(strip.row, strip.color, strip.height, strip.valid, strip.source)
+    return time.perf_counter() - begin
+
+
+def through(engine: Engine, archive: Path, calibration: Path, output: Path) -> float:
+    """Seconds of the same through an engine, ledger, kept depth and all."""
+    output.mkdir()
+    begin = time.perf_counter()
+    with Ledger(output / LEDGER_FILE) as ledger:
+        plan = plan_run(find_scans(str(archive)), read_calibrations(calibration), PROCESSING, {}, output)
+        place = Place(ledger, output, PROCESSING, False)
+        rows = run_jobs([(s.key, scan_job(s, place)) for s in plan.to_do], engine, place, lambda task, result: None)
+    if any(row.status != "done" for row in rows):
+        raise RuntimeError(f"not every scan was done: {rows}")
+    return time.perf_counter() - begin
+
+
+def peak_memory_mb(engine: Engine, workers: int) -> int:
+    """The most that any worker took so far."""
+    for number in range(workers):
+        engine.submit(Task("memory", PeakMemory(number)))
+    found: list[int] = []
+    while len(found) < workers:
+        found += [result.measured for _, result in engine.collect()]
+    return max(found) >> 10
+
+
+@contextmanager
+def started(make: Callable[[], Engine], workers: int) -> Iterator[Engine]:
+    """An engine whose workers have answered."""
+    with make() as engine:
+        peak_memory_mb(engine, workers)
+        yield engine
+
+
+def run() -> dict[str, object]:
+    """Lines a second of the bare stages and of every engine, medians of turns taken one after the other."""
+    torch.set_num_threads(1)
+    engines: dict[str, tuple[Callable[[], Engine], int]] = {
+        "local_1": (lambda: LocalEngine(1), 1),
+        "local_2": (lambda: LocalEngine(2), 2),
+        "dask_1": (lambda: DaskEngine(None, 1, WORKER_MEMORY_MB), 1),
+        "dask_2": (lambda: DaskEngine(None, 2, WORKER_MEMORY_MB), 2),
+    }
+    seconds: dict[str, list[float]] = {name: [] for name in engines}
+    reference: dict[str, list[float]] = {name: [] for name in engines}
+    memory: dict[str, int] = {}
+    with tempfile.TemporaryDirectory() as folder:
+        root = Path(folder)
+        calibration = make_archive(root / "archive")
+        for name, (make, workers) in engines.items():
+            with started(make, workers) as engine:
+                for turn in range(TURNS):
+                    reference[name].append(bare(root / "archive", calibration, root / f"bare {name} {turn}"))
+                    seconds[name].append(through(engine, root / "archive", calibration, root / f"{name} {turn}"))
+                memory[name] = peak_memory_mb(engine, workers)
+    ratio = {
+        name: statistics.median(b / s for b, s in zip(reference[name], seconds[name], strict=True)) for name in engines
+    }
+    lines = SCANS * LINES
+    best = statistics.median(value for values in reference.values() for value in values)
+    return {
+        "unit": f"lines of {RIG.width_px} px per second, matched and corrected",
+        "bare": round(lines / best),
+        **{name: round(lines / statistics.median(values)) for name, values in seconds.items()},
+        "ratio": round(ratio["local_1"], 3),
+        "overhead_percent": {name: round(100 * (1 / ratio[name] - 1), 1) for name in ("local_1", "dask_1")},
+        "two_over_one": {kind: round(ratio[f"{kind}_2"] / ratio[f"{kind}_1"], 2) for kind in ("local", "dask")},
+        "worker_memory_mb": memory,
+        "worker_memory_bound_mb": WORKER_MEMORY_MB,
+    }
