@@ -10,12 +10,12 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from lsvision.image.saddle import SaddleFit, fit_saddles
-from lsvision.types import Board, LineImage
+from lsvision.types import Board, LineImage, TensorImage
 
-# Luma of ITU-R BT.601; any fixed weights would do, both views only have to share them.
-_LUMA = (0.299, 0.587, 0.114)
 _REDUCED_WIDTH = 900  # columns in which the coarse search runs: squares of a full-field board still have 40 px
 _READ_LINES = 512
+_REDUCE_LINES = 64  # as many as stay in the processor's cache
+_INTO_SQUARES = 0.4  # share of a square that a window takes in: blur and shift stay clear of the next edges
 # How far the fit of a window may be from the board's median: a corner under glare, smear or dirt is another picture.
 _WORST_RESIDUAL, _WORST_BLUR, _LEAST_CONTRAST = 3.0, 2.0, 0.3
 
@@ -29,12 +29,13 @@ class DetectedCorners:
     valid: Bool[Tensor, " corners"]
 
 
-def gray(lines: Tensor) -> Float[Tensor, "lines width"]:
-    """Brightness of ``(lines, width, 1 or 3)`` values of any type as float32 on their own scale."""
+def gray(lines: Tensor) -> Float[Tensor, "*batch lines width"]:
+    """Brightness, luma of ITU-R BT.601, of ``(*batch, lines, width, 1 or 3)`` values of any type, float32, unscaled."""
     values = lines.to(torch.float32)
     if values.shape[-1] == 1:
         return values[..., 0]
-    return values[..., :3] @ values.new_tensor(_LUMA)
+    flat = values[..., :3].reshape(-1, values.shape[-2], 3)
+    return torch.from_numpy(cv2.cvtColor(flat.numpy(), cv2.COLOR_RGB2GRAY)).reshape(values.shape[:-1])
 
 
 def detect_board(image: LineImage, board: Board, *, mirrored: bool = False) -> DetectedCorners | None:
@@ -53,6 +54,10 @@ def detect_board(image: LineImage, board: Board, *, mirrored: bool = False) -> D
     if grid is None:
         return None
     ordered = order_grid(grid, reduced, mirrored=mirrored)
+    if factor > 1:
+        # A tenth of a pixel of the copy is already a pixel of the image; the fit of the copy is better than that.
+        coarse = refine_grid(TensorImage(reduced[..., None]), ordered, largest_radius=8)
+        ordered = torch.where(coarse.valid[:, None], coarse.position, ordered.reshape(-1, 2)).reshape(ordered.shape)
     return refine_grid(image, (ordered + 0.5) * factor - 0.5)
 
 
@@ -61,7 +66,7 @@ def reduce_image(image: LineImage, factor: int) -> Float[Tensor, "lines width"]:
     lines, width, _ = image.shape
     kept = width - width % factor
     blocks = []
-    step = max(factor, _READ_LINES - _READ_LINES % factor)
+    step = max(factor, _REDUCE_LINES - _REDUCE_LINES % factor)
     for start in range(0, lines - lines % factor, step):
         stop = min(start + step, lines - lines % factor)
         blocks.append(F.avg_pool2d(gray(image.read(start, stop))[None, :, :kept], factor)[0])
@@ -111,19 +116,36 @@ def order_grid(
     return grid if score > turned_score else turned
 
 
-def refine_grid(image: LineImage, grid: Float[Tensor, "rows columns 2"]) -> DetectedCorners:
-    """Locate corners at full size, from a grid good to about two pixels: one batch of windows, fitted together."""
+def refine_grid(
+    image: LineImage, grid: Float[Tensor, "rows columns 2"], *, largest_radius: int = 13
+) -> DetectedCorners:
+    """Locate corners at full size, from a grid good to about two pixels: one batch of windows, fitted together.
+
+    A window reaches into the four squares around its corner, at any angle, shear and stretch, and at most
+    ``largest_radius`` px: past it the board's own texture weighs more than what is gained.
+    """
     points = grid.reshape(-1, 2)
     along_x, along_y = _neighbour_vectors(grid)
-    spacing = torch.minimum(along_x.norm(dim=-1), along_y.norm(dim=-1)).min()
-    # Edges along the pixels need a long run; past it the board's own texture weighs more than what is gained.
-    radius = int((0.35 * spacing).clamp(3, 13))
+    extent = _INTO_SQUARES * (along_x.abs() + along_y.abs()).amax()
+    radius = int(extent.ceil().clamp(3, largest_radius))
     centre = points.round().long()
     windows, inside = _windows(image, centre, radius)
+    mask = _within_squares(torch.stack([along_x, along_y], dim=-1), radius)
     # The edge along X has its normal a quarter turn from the tangent along X.
     angles = torch.stack([torch.atan2(d[:, 1], d[:, 0]) + torch.pi / 2 for d in (along_x, along_y)], dim=-1)
-    fit = fit_saddles(windows, angles.to(windows))
+    fit = fit_saddles(windows, angles.to(windows), mask)
     return _detected(fit, centre, inside)
+
+
+def _within_squares(steps: Tensor, radius: int) -> Tensor:
+    """Pixels (corners, size, size) of windows that lie well within the four squares around their corners."""
+    span = torch.arange(-radius, radius + 1, dtype=steps.dtype)
+    offset = torch.stack(torch.meshgrid(span, span, indexing="xy")).flatten(1)
+    share = torch.linalg.solve(steps, offset.expand(len(steps), 2, -1))
+    size = 2 * radius + 1
+    mask = (share.abs() < _INTO_SQUARES).all(1).unflatten(-1, (size, size))
+    # Corners closer than four pixels leave too few pixels to fit anything to: then the whole window has to do.
+    return mask | (mask.sum((1, 2)) < 49)[:, None, None]
 
 
 def _detected(fit: SaddleFit, centre: Tensor, inside: Tensor) -> DetectedCorners:
@@ -154,10 +176,10 @@ def _windows(image: LineImage, centre: Tensor, radius: int) -> tuple[Tensor, Ten
         here = inside & (centre[:, 1] - radius >= start) & (centre[:, 1] - radius < start + _READ_LINES)
         if not bool(here.any()):
             continue
-        strip = gray(image.read(start, min(lines, start + _READ_LINES + size))).to(torch.float64)
+        strip = image.read(start, min(lines, start + _READ_LINES + size))
         rows = (centre[here, 1, None] + span - start)[:, :, None]
         columns = (centre[here, 0, None] + span)[:, None, :]
-        windows[here] = strip[rows, columns]
+        windows[here] = gray(strip[rows, columns]).to(torch.float64)
     return windows, inside
 
 

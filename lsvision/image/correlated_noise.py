@@ -14,6 +14,7 @@ def correlation_gain(
     inverse_normal: Float[Tensor, "fits parameters parameters"],
     wanted: slice,
     residual: Float[Tensor, "fits pixels"],
+    variance: Float[Tensor, " fits"],
     size: int,
 ) -> Float[Tensor, " fits"]:
     """Variance of the wanted parameters of least-squares fits, over the one that independent noise would give.
@@ -24,18 +25,16 @@ def correlation_gain(
     see the pixels at their two ends less often than neighbours; twice the long ones' less the short ones' does not.
 
     Args:
-        jacobian: derivative of square windows, ``pixels = size²``, by the parameters.
+        jacobian: derivative of square windows, ``pixels = size²``, by the parameters; 0 at pixels left out.
         inverse_normal: inverse of ``J Jᵀ``.
         wanted: the parameters whose summed variance counts.
-        residual: of the fit.
+        residual: of the fit; 0 at pixels left out. variance: of a pixel's residual.
 
     Source: Conley 1999, GMM estimation with cross sectional dependence; Politis & Romano 1995, the flat-top window.
     """
     influence = inverse_normal[:, wanted] @ jacobian
     products = (influence[:, :, None] * jacobian[:, None]).flatten(1, 2)
     cells = _cell_sums(torch.cat([influence * residual[:, None], products], dim=1), size)
-    # What independent noise gives: variance by pixel.
-    variance = residual.square().sum(-1) / (residual.shape[-1] - jacobian.shape[1])
     white = variance.clamp(min=torch.finfo(residual.dtype).tiny), influence.square().sum((1, 2))
     short, long = (_gain(cells, inverse_normal, influence.shape[1], white, block) for block in (_SHORT, _LONG))
     return 2 * long - short

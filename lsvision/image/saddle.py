@@ -39,6 +39,7 @@ class SaddleFit:
 def fit_saddles(
     windows: Float[Tensor, "corners size size"],
     angles: Float[Tensor, "corners 2"],
+    mask: Bool[Tensor, "corners size size"] | None = None,
     *,
     iterations: int = 12,
     max_shift_px: float = 3.0,
@@ -54,6 +55,7 @@ def fit_saddles(
     Args:
         windows: grey values, odd size; the corner within about two pixels of the centre. One with a NaN is not valid.
         angles: direction of the normal of each edge, rad from u towards v; good to about 0.3 rad.
+        mask: pixels to fit, all where None: those of the four squares around the corner, say.
         iterations: largest number of steps of either model.
         max_shift_px: a corner further than this from the centre is not valid.
         max_residual: neither is one whose residual rms exceeds this share of its contrast.
@@ -62,15 +64,16 @@ def fit_saddles(
     half = (size - 1) / 2
     axis = torch.arange(size, dtype=windows.dtype, device=windows.device) - half
     grid = torch.stack(torch.meshgrid(axis, axis, indexing="xy")).flatten(1)
-    values = windows.reshape(count, -1)
-    complete = torch.isfinite(values).all(-1)
-    values = torch.where(complete[:, None], values, 0.0)
-    parameters = _initial_parameters(values, grid, angles)
+    complete = torch.isfinite(windows).flatten(1).all(-1)
+    weight = torch.ones_like(windows) if mask is None else mask.to(windows.dtype)
+    weight = weight.reshape(count, -1)
+    values = torch.where(complete[:, None], windows.reshape(count, -1), 0.0) * weight
+    parameters = _initial_parameters(values, grid, weight, angles)
     for free in (_PLAIN, _FULL):
-        parameters = _descend(parameters, values, grid, free, iterations)
-    model, jacobian = _saddle(parameters, grid)
+        parameters = _descend(parameters, values, grid, weight, free, iterations)
+    model, jacobian = _saddle(parameters, grid, weight)
     residual = values - model
-    variance = residual.square().sum(-1) / (size * size - _PARAMETERS)
+    variance = residual.square().sum(-1) / (weight.sum(-1) - _PARAMETERS).clamp(min=1)
     inverse = _inverse_normal(jacobian)
     position, contrast = parameters[:, _POSITION], parameters[:, _CONTRAST].abs()
     crossing = torch.sin(parameters[:, _ANGLE_1] - parameters[:, _ANGLE_2]).abs()
@@ -84,7 +87,7 @@ def fit_saddles(
     return SaddleFit(
         position,
         inverse[:, _POSITION, _POSITION] * variance[:, None, None],
-        correlation_gain(jacobian, inverse, _POSITION, residual, size),
+        correlation_gain(jacobian, inverse, _POSITION, residual, variance, size),
         parameters[:, _BLUR],
         contrast,
         variance.sqrt(),
@@ -92,17 +95,19 @@ def fit_saddles(
     )
 
 
-def _descend(parameters: Tensor, values: Tensor, grid: Tensor, free: list[int], iterations: int) -> Tensor:
+def _descend(
+    parameters: Tensor, values: Tensor, grid: Tensor, weight: Tensor, free: list[int], iterations: int
+) -> Tensor:
     """Levenberg-Marquardt on the ``free`` parameters, each window on its own until its corner stands still."""
     damping = torch.full_like(values[:, 0], 1e-3)
     moving = torch.ones_like(damping, dtype=torch.bool)
-    model, jacobian = _saddle(parameters, grid)
+    model, jacobian = _saddle(parameters, grid, weight)
     cost = (values - model).square().sum(-1)
     for _ in range(iterations):
         step = torch.zeros_like(parameters)
         step[:, free] = _damped_step(jacobian[:, free], values - model, damping)
         trial = _bounded(parameters + step)
-        trial_model, trial_jacobian = _saddle(trial, grid)
+        trial_model, trial_jacobian = _saddle(trial, grid, weight)
         trial_cost = (values - trial_model).square().sum(-1)
         better = moving & (trial_cost < cost)
         parameters = torch.where(better[:, None], trial, parameters)
@@ -116,8 +121,8 @@ def _descend(parameters: Tensor, values: Tensor, grid: Tensor, free: list[int], 
     return parameters
 
 
-def _saddle(parameters: Tensor, grid: Tensor) -> tuple[Tensor, Tensor]:
-    """Model values (corners, pixels) and their Jacobian (corners, 17, pixels)."""
+def _saddle(parameters: Tensor, grid: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
+    """Weighted model values (corners, pixels) and their Jacobian (corners, 17, pixels)."""
     position, blur = parameters[:, _POSITION], parameters[:, _BLUR, None]
     u, v = grid[0] - position[:, :1], grid[1] - position[:, 1:]
     edges = [_edge(u, v, parameters[:, angle, None], blur) for angle in (_ANGLE_1, _ANGLE_2)]
@@ -135,7 +140,8 @@ def _saddle(parameters: Tensor, grid: Tensor) -> tuple[Tensor, Tensor]:
         -(slope_1 * across_1 + slope_2 * across_2) / blur,
     ]
     by_levels = (shapes[:, :, None] * plane).flatten(1, 2)
-    return (levels * shapes).sum(1), torch.cat([torch.stack(by_shape, dim=1), by_levels], dim=1)
+    jacobian = torch.cat([torch.stack(by_shape, dim=1), by_levels], dim=1)
+    return (levels * shapes).sum(1) * weight, jacobian * weight[:, None]
 
 
 def _edge(
@@ -149,17 +155,18 @@ def _edge(
     return torch.erf(scaled), rise, (cosine, sine), along, across
 
 
-def _initial_parameters(values: Tensor, grid: Tensor, angles: Tensor) -> Tensor:
+def _initial_parameters(values: Tensor, grid: Tensor, weight: Tensor, angles: Tensor) -> Tensor:
     """Corner at the centre, blur of one pixel, contrast by projection on that pattern (its sign matters)."""
     parameters = values.new_zeros(values.shape[0], _PARAMETERS)
     parameters[:, _ANGLE_1 : _ANGLE_2 + 1] = angles
     parameters[:, _BLUR] = 1.0
     parameters[:, _CONTRAST] = 1.0
-    pattern, _ = _saddle(parameters, grid)
-    mean = values.mean(-1)
-    centred = pattern - pattern.mean(-1, keepdim=True)
+    pattern, _ = _saddle(parameters, grid, weight)
+    pixels = weight.sum(-1)
+    mean, middle = values.sum(-1) / pixels, pattern.sum(-1) / pixels
+    centred = pattern - middle[:, None] * weight
     parameters[:, _CONTRAST] = (centred * values).sum(-1) / centred.square().sum(-1)
-    parameters[:, _OFFSET] = mean - parameters[:, _CONTRAST] * pattern.mean(-1)
+    parameters[:, _OFFSET] = mean - parameters[:, _CONTRAST] * middle
     return parameters
 
 

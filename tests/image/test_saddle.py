@@ -25,7 +25,7 @@ def test_model_by_hand():
     # both edges are erf(1 / sqrt 2), the share of a normal distribution within one sigma. Right of the first edge lies
     # another 4, more of it further down.
     parameters = torch.tensor([[0.5, -0.25, 0.0, math.pi / 2, 1.0, 50, 2, 0, 4, 0, 1, 0, 0, 0, 10, 0, 0]]).double()
-    value, _ = _saddle(parameters, torch.tensor([[1.5, 0.5], [0.75, -0.25]], dtype=torch.float64))
+    value, _ = _saddle(parameters, torch.tensor([[1.5, 0.5], [0.75, -0.25]]).double(), torch.ones(1, 2).double())
     share = 0.6826894921370859
     expected = torch.tensor([53.0 + (4 + 0.75) * share + 10 * share**2, 51.0]).double()
     torch.testing.assert_close(value[0], expected)
@@ -37,8 +37,9 @@ def test_jacobian_is_the_derivative(corners):
     parameters = torch.cat([position, angles, blur[:, None], levels], dim=-1)
     axis = torch.arange(-3, 4, dtype=torch.float64)
     grid = torch.stack(torch.meshgrid(axis, axis, indexing="xy")).flatten(1)
-    by_autograd = torch.autograd.functional.jacobian(lambda p: _saddle(p, grid)[0], parameters)
-    ours = _saddle(parameters, grid)[1]
+    weight = (torch.rand(3, 49) > 0.2).double()
+    by_autograd = torch.autograd.functional.jacobian(lambda p: _saddle(p, grid, weight)[0], parameters)
+    ours = _saddle(parameters, grid, weight)[1]
     for i in range(3):
         torch.testing.assert_close(ours[i].mT, by_autograd[i, :, i], rtol=0, atol=1e-9)
 
