@@ -11,7 +11,7 @@ import time
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -79,10 +79,10 @@ class MatchStrip:
         stop = min(start + self.config.strip_lines, scan.lines)
         matched = MatchedDepth(scan, self.config, kept_strips=1)
         z = matched.read(start, stop)[..., 0]
-        zarr.open_array(f"{self.depth}/{DEPTH}", mode="r+")[start:stop] = z.numpy()
+        _open_array(f"{self.depth}/{DEPTH}")[start:stop] = z.numpy()
         if self.with_sigma:
             sigma = matched.read_sigma(start, stop)[..., 0]
-            zarr.open_array(f"{self.depth}/{SIGMA}", mode="r+")[start:stop] = sigma.numpy()
+            _open_array(f"{self.depth}/{SIGMA}")[start:stop] = sigma.numpy()
         return TaskResult(lines=stop - start, measured=int(torch.isfinite(z).sum()))
 
 
@@ -109,7 +109,7 @@ class CorrectStrip:
         first = self.number * self.config.strip_rows
         rows = first, min(first + self.config.strip_rows, grid.rows)
         strip = correct_rows(scan, depth, motion, self.config, grid, rows, sigma)
-        ProductRows(self.product).write(strip.row, strip.color, strip.height, strip.valid, strip.source, strip.sigma)
+        _open_product(self.product).write(strip.row, strip.color, strip.height, strip.valid, strip.source, strip.sigma)
         return TaskResult(lines=rows[1] - rows[0], measured=int(strip.valid.sum()))
 
 
@@ -215,3 +215,14 @@ def _open_depth(path: str) -> tuple[LineImage, LineImage | None]:
     """Depth and its standard deviation, where that was asked for."""
     sigma = Path(path, SIGMA)
     return open_line_image(Path(path, DEPTH)), open_line_image(sigma) if sigma.is_dir() else None
+
+
+# Opening costs as much as computing a small strip; a folder of one name is always laid out the same.
+@lru_cache(maxsize=2)
+def _open_product(path: str) -> ProductRows:
+    return ProductRows(path)
+
+
+@lru_cache(maxsize=4)
+def _open_array(path: str) -> Any:
+    return zarr.open_array(path, mode="r+")

@@ -42,14 +42,15 @@ PROCESSING = Processing(DisparityConfig(strip_lines=256), CorrectionConfig(strip
 
 
 @dataclass(frozen=True)
-class PeakMemory:
-    """The most memory, in KiB, that the worker which runs it ever took."""
+class Usage:
+    """The most memory, in KiB, that the worker which runs it ever took, and its processor seconds as text."""
 
     number: int
 
     def run(self) -> TaskResult:
         """Ask the system."""
-        return TaskResult(measured=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
+        used = resource.getrusage(resource.RUSAGE_SELF)
+        return TaskResult(measured=used.ru_maxrss, value=str(used.ru_utime + used.ru_stime))
 
 
 def make_archive(root: Path) -> Path:
@@ -98,21 +99,21 @@ def through(engine: Engine, archive: Path, calibration: Path, output: Path) -> f
     return time.perf_counter() - begin
 
 
-def peak_memory_mb(engine: Engine, workers: int) -> int:
-    """The most that any worker took so far."""
+def usage(engine: Engine, workers: int) -> tuple[int, float]:
+    """The most memory, MB, that a worker took so far, and the processor seconds of a lone worker and this process."""
     for number in range(workers):
-        engine.submit(Task("memory", PeakMemory(number)))
-    found: list[int] = []
+        engine.submit(Task("usage", Usage(number)))
+    found: list[TaskResult] = []
     while len(found) < workers:
-        found += [result.measured for _, result in engine.collect()]
-    return max(found) >> 10
+        found += [result for _, result in engine.collect()]
+    return max(result.measured for result in found) >> 10, float(found[0].value) + time.process_time()
 
 
 @contextmanager
 def started(make: Callable[[], Engine], workers: int) -> Iterator[Engine]:
     """An engine whose workers have answered."""
     with make() as engine:
-        peak_memory_mb(engine, workers)
+        usage(engine, workers)
         yield engine
 
 
@@ -127,6 +128,7 @@ def run() -> dict[str, object]:
     }
     seconds: dict[str, list[float]] = {name: [] for name in engines}
     reference: dict[str, list[float]] = {name: [] for name in engines}
+    processor: dict[str, list[float]] = {name: [] for name in engines}
     memory: dict[str, int] = {}
     with tempfile.TemporaryDirectory() as folder:
         root = Path(folder)
@@ -134,9 +136,12 @@ def run() -> dict[str, object]:
         for name, (make, workers) in engines.items():
             with started(make, workers) as engine:
                 for turn in range(TURNS):
+                    before = time.process_time()
                     reference[name].append(bare(root / "archive", calibration, root / f"bare {name} {turn}"))
+                    of_stages, (_, before) = time.process_time() - before, usage(engine, workers)
                     seconds[name].append(through(engine, root / "archive", calibration, root / f"{name} {turn}"))
-                memory[name] = peak_memory_mb(engine, workers)
+                    memory[name], after = usage(engine, workers)
+                    processor[name].append((after - before) / of_stages)
     ratio = {
         name: statistics.median(b / s for b, s in zip(reference[name], seconds[name], strict=True)) for name in engines
     }
@@ -148,6 +153,9 @@ def run() -> dict[str, object]:
         **{name: round(lines / statistics.median(values)) for name, values in seconds.items()},
         "ratio": round(ratio["local_1"], 3),
         "overhead_percent": {name: round(100 * (1 / ratio[name] - 1), 1) for name in ("local_1", "dask_1")},
+        "processor_overhead_percent": {
+            name: round(100 * (statistics.median(processor[name]) - 1), 1) for name in ("local_1", "dask_1")
+        },
         "two_over_one": {kind: round(ratio[f"{kind}_2"] / ratio[f"{kind}_1"], 2) for kind in ("local", "dask")},
         "worker_memory_mb": memory,
         "worker_memory_bound_mb": WORKER_MEMORY_MB,
