@@ -82,6 +82,12 @@ class BoardProblem:
         return upper_root(columns.flatten(-2).mT)
 
     @cached_property
+    def residual_rows(self) -> Float[Tensor, "*batch boards 7 7"]:
+        """Rows of (1, p, x, y, z) of the valid corners, reduced: all that sums of squared residuals depend on."""
+        rows = torch.cat([torch.ones_like(self.points[..., :1]), self.body_points, self.points], dim=-1)
+        return upper_root(torch.where(self.valid[..., None], rows, 0.0))
+
+    @cached_property
     def noise_log_det(self) -> Float[Tensor, "*batch"]:
         """Log-determinant of the covariance of all valid corners' points."""
         by_corner = self.noise_chol.diagonal(dim1=-2, dim2=-1).log().sum(-1)
@@ -120,13 +126,15 @@ def split_state(
     return poses[..., :3], poses[..., 3:], state[..., -3:]
 
 
-def residuals(problem: BoardProblem, state: Float[Tensor, "*#batch state"]) -> Float[Tensor, "*batch boards corners 3"]:
-    """Residuals e of all corners, mm; zero where a corner was not seen."""
+def squared_residuals(problem: BoardProblem, state: Float[Tensor, "*#batch state"]) -> Float[Tensor, "*batch boards"]:
+    """Sums ‖e‖², mm², of the residuals of each board's valid corners."""
     theta, position, n = split_state(state)
     rotation = rotation_from_vector(theta) @ problem.rotation
-    predicted = transform(rotation, position, problem.body_points)
-    error = displace(problem.points, n[..., None, None, :]) - predicted
-    return torch.where(problem.valid[..., None], error, 0.0)
+    eye = torch.eye(3, dtype=n.dtype, device=n.device)
+    motion = torch.stack([eye[0].expand_as(n), n, eye[2].expand_as(n)], dim=-2)[..., None, :, :]
+    coefficients = torch.cat([-position[..., None, :], -rotation.mT, motion.expand_as(rotation)], dim=-2)
+    error = (problem.residual_rows[..., None] * coefficients[..., None, :, :]).sum(-2)
+    return error.square().sum((-2, -1))
 
 
 def whitened_residuals(problem: BoardProblem, state: Float[Tensor, "*#batch state"]) -> Float[Tensor, "*batch rows"]:

@@ -16,8 +16,8 @@ from lsvision.stages.board_model import (
     MountingPitch,
     linearise,
     nominal_problem,
-    residuals,
     rotations,
+    squared_residuals,
     translations,
 )
 from lsvision.stages.motion_estimate import METHODS, CalibrationConfig, estimate, rmse
@@ -265,7 +265,7 @@ def _summary(problem: BoardProblem, start: Tensor, posterior: Posterior, scale: 
 
 
 def _board_rmse(problem: BoardProblem, state: Tensor) -> Tensor:
-    return (residuals(problem, state).square().sum((-2, -1)) / problem.valid.sum(-1)).sqrt()
+    return (squared_residuals(problem, state) / problem.valid.sum(-1)).sqrt()
 
 
 def _iterations(batch: BatchCalibration) -> tuple[Iteration, ...]:

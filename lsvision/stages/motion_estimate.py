@@ -28,7 +28,7 @@ from lsvision.stages.board_model import (
     BoardProblem,
     corner_rows,
     linearise,
-    residuals,
+    squared_residuals,
     whitened_residuals,
 )
 from lsvision.types import CalibrationMethod
@@ -165,7 +165,7 @@ def prior_root(start: Float[Tensor, "*batch state"], config: CalibrationConfig) 
 
 def rmse(problem: BoardProblem, state: Float[Tensor, "*#batch state"]) -> Float[Tensor, "*batch"]:
     """Root-mean-square residual over all corners of all boards, mm."""
-    squared = residuals(problem, state).square().sum((-3, -2, -1))
+    squared = squared_residuals(problem, state).sum(-1)
     return (squared / problem.valid.sum((-2, -1))).sqrt()
 
 

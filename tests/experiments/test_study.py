@@ -26,7 +26,7 @@ from lsvision.experiments.study_runs import noisy_points, run_points
 from lsvision.experiments.study_tables import iterations_table, points_table, runs_table
 from lsvision.geometry import displace, transform
 from lsvision.run import config_folder
-from lsvision.stages.board_model import residuals, whitened_residuals
+from lsvision.stages.board_model import squared_residuals, whitened_residuals
 from lsvision.stages.calibration import CalibrationConfig, calibrate_batch
 from lsvision.types import Board
 
@@ -93,7 +93,7 @@ def test_exact_corners_fit_the_truth(rig):
     # From normals tilted by (2°, 1.5°) and (-5°, 1°).
     assert corners.tilt_spread_deg == pytest.approx(7.0, abs=0.3)
     problem, state = true_problem(corners, noise_chol(POINT))
-    assert residuals(problem, state).abs().max() < 1e-9
+    assert squared_residuals(problem, state).max() < 1e-16
 
 
 def test_information_is_that_of_the_exact_likelihood(rig):

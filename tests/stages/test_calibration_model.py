@@ -15,13 +15,19 @@ from lsvision.stages.board_model import (
     linearise,
     motion_information,
     nominal_problem,
-    residuals,
     rotations,
     split_state,
+    squared_residuals,
     translations,
     whitened_residuals,
 )
 from tests.stages.boards import SIGMA, simulate
+
+
+def residuals(corners, problem, state):
+    """Displaced measurements less the board."""
+    moved = displace(corners.points, split_state(state)[2][..., None, None, :])
+    return moved - (corners.board_points @ rotations(problem, state).mT + translations(problem, state)[..., None, :])
 
 
 def spread(sigma: float, size: int) -> torch.Tensor:
@@ -31,7 +37,7 @@ def spread(sigma: float, size: int) -> torch.Tensor:
 def test_start_is_the_best_fit_without_motion_correction_and_poses_are_told_apart():
     corners = simulate(sigma=(0.0, 0.0, 0.0), n=torch.tensor([0.0, 1.0, 0.0]).double())
     problem, start = corners.problem()
-    assert residuals(problem, start).abs().max() < 1e-9
+    assert squared_residuals(problem, start).max() < 1e-16
     torch.testing.assert_close(rotations(problem, start), corners.rotation)
     torch.testing.assert_close(translations(problem, start), corners.translation)
     assert split_state(start)[2].tolist() == [0.0, 1.0, 0.0]
@@ -67,7 +73,7 @@ def test_noise_is_that_of_the_residual_re_evaluated_at_n():
     """Cov e = M Σ Mᵀ with M = [e_x | n | e_z]; for independent noise R + σ_y² n nᵀ."""
     corners = simulate([(5.0, 3.0, 1.0)])
     problem, start = corners.problem()
-    e, white = residuals(problem, start)[0], whitened_residuals(problem, start).reshape(-1, 3)
+    e, white = residuals(corners, problem, start)[0], whitened_residuals(problem, start).reshape(-1, 3)
     n = split_state(start)[2]
     M = torch.eye(3, dtype=torch.float64)
     M[:, 1] = n
@@ -144,12 +150,8 @@ def test_pitch_row_tends_to_the_derivative_with_the_square_of_sigma():
         assert wide / narrow == pytest.approx(100.0, rel=0.2)
 
 
-def test_residual_is_displaced_measurement_less_board():
+def test_squared_residuals_are_those_of_displaced_measurements_less_the_board():
     corners = simulate(batch=(2,))
     problem, start = corners.problem()
-    n = split_state(start)[2]
-    moved = displace(corners.points, n[:, None, None])
-    expected = moved - (
-        corners.board_points @ rotations(problem, start).mT + translations(problem, start)[..., None, :]
-    )
-    torch.testing.assert_close(residuals(problem, start), expected, rtol=0, atol=1e-10)
+    expected = residuals(corners, problem, start)
+    torch.testing.assert_close(squared_residuals(problem, start), expected.square().sum((-2, -1)), rtol=1e-10, atol=0)
