@@ -23,7 +23,7 @@ def visible_segments(
         cells: number of cells, at 0, 1, .., cells - 1.
 
     Returns:
-        Index i of the segment (i, i + 1), -1 where nothing covers the cell, and the fraction 0..1 along it.
+        Index i of the segment (i, i + 1) and the fraction 0..1 along it; -1 and NaN where nothing covers the cell.
     """
     following = position.ceil()
     first = following[:, :-1].clamp(min=0)
@@ -32,7 +32,7 @@ def visible_segments(
     start = segment.clamp(min=0)
     axis = torch.arange(cells, dtype=position.dtype, device=position.device)
     before, after = position.gather(1, start), position.gather(1, start + 1)
-    return segment, torch.where(segment >= 0, (axis - before) / (after - before), 0.0)
+    return segment, torch.where(segment >= 0, (axis - before) / (after - before), torch.nan)
 
 
 def _claimed_cells(position: Tensor, depth: Tensor, first: Tensor, count: Tensor, cells: int) -> Tensor:
@@ -87,10 +87,9 @@ def _settle(held: Tensor, position: Tensor, depth: Tensor, line: Tensor, segment
 def interpolate_segments(
     values: Float[Tensor, "lines samples"], segment: Int[Tensor, "lines cells"], fraction: Float[Tensor, "lines cells"]
 ) -> Float[Tensor, "lines cells"]:
-    """Values at a fraction along segments, NaN where there is none."""
+    """Values at a fraction along segments; NaN where that is NaN."""
     start = segment.clamp(min=0)
-    blended = torch.lerp(values.gather(1, start), values.gather(1, start + 1), fraction.to(values.dtype))
-    return torch.where(segment >= 0, blended, torch.nan)
+    return torch.lerp(values.gather(1, start), values.gather(1, start + 1), fraction.to(values.dtype))
 
 
 def both_ends(flags: Bool[Tensor, "lines samples"], segment: Int[Tensor, "lines cells"]) -> Bool[Tensor, "lines cells"]:
@@ -107,7 +106,7 @@ def bridge_gaps(
     Args:
         largest_step: largest change per sample between the ends; beyond it the hole hides a step and stays open.
     """
-    known = torch.isfinite(values)
+    known = ~values.isnan()
     if bool(known.all()):
         return values
     samples = values.shape[1]

@@ -165,15 +165,14 @@ def _correct_rows(correction: _Correction, rows: tuple[int, int]) -> ProductStri
         if seen is None:
             return
         strip.color[tile] = lines.colors.sample(image, seen.line, seen.column, seen.q_z, correction.config)
-        valid = seen.measured & torch.isfinite(seen.column)
-        strip.valid[tile] = valid
-        strip.height[tile] = torch.where(valid, scan.rig.zero_disparity_mm - seen.q_z, torch.nan).float()
+        strip.valid[tile] = seen.measured
+        strip.height[tile] = torch.where(seen.measured, scan.rig.zero_disparity_mm - seen.q_z, torch.nan)
         strip.source[tile][..., 0], strip.source[tile][..., 1] = seen.line, seen.column
         if strip.sigma is not None:
             sigma = position_sigma(
                 scan, motion, seen.line, seen.column, seen.q_z, correction.config.disparity_sigma_px, seen.sigma
             )
-            strip.sigma[tile] = torch.where(valid[..., None], sigma, torch.nan).float()
+            strip.sigma[tile] = torch.where(seen.measured[..., None], sigma, torch.nan)
 
     in_parallel(fill, tiles(rows[1] - rows[0], correction.grid.columns))
     return strip
@@ -211,7 +210,7 @@ def _locate(correction: _Correction, lines: _Lines, row: int, rows: slice, colum
     measured = both_ends(by_column(profiles.measured), segment) & (missed <= _MISSED_LINES)[segment.clamp(min=0)]
     line = ((stop - 1) - segment) - fraction if backwards else (start + segment) + fraction
     return _Seen(
-        line=torch.where(segment >= 0, line, torch.nan).mT.contiguous(),
+        line=line.mT.contiguous(),
         column=seen(by_column(profiles.column)),
         q_z=seen(q_z),
         measured=measured.mT.contiguous(),

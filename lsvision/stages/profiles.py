@@ -60,7 +60,7 @@ def resolve_profiles(z: Tensor, sigma: Tensor | None, rig: Rig, motion: Motion, 
     connected = z.diff(dim=1).abs() <= rule.largest_step_mm  # false beside a hole
     segment, fraction = visible_segments(position, q_z, connected, rule.columns)
     return Profiles(
-        column=torch.where(segment >= 0, segment + fraction, torch.nan),
+        column=segment + fraction,
         q_z=interpolate_segments(q_z, segment, fraction),
         measured=both_ends(measured, segment),
         sigma=None if sigma is None else interpolate_segments(sigma, segment, fraction),
