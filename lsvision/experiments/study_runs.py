@@ -79,11 +79,13 @@ def noisy_points(corners: ExactCorners, conditions: Conditions, seed: int, first
     drawn = [_draws(corners, (seed * _BLOCKS_PER_SEED + block) % 2**32) for block in blocks]
     skip = first - blocks.start * _BLOCK
     white, phase = (torch.cat(parts)[skip : skip + last - first] for parts in zip(*drawn, strict=True))
+    noisy = corners.points + white * noise_chol(conditions).diagonal()
+    if conditions.vibration_mm == conditions.encoder_mm == 0:
+        return noisy
     travel = corners.points[..., 1]
     vibration = conditions.vibration_mm * _wave(travel, conditions.vibration_wavelength_mm, phase[..., :2])
     encoder = conditions.encoder_mm * _wave(travel, conditions.encoder_wavelength_mm, phase[..., 2:])
-    smooth = torch.stack([vibration[..., 0], encoder[..., 0], vibration[..., 1]], dim=-1)
-    return corners.points + smooth + white * noise_chol(conditions).diagonal()
+    return noisy + torch.stack([vibration[..., 0], encoder[..., 0], vibration[..., 1]], dim=-1)
 
 
 def _draws(corners: ExactCorners, seed: int) -> tuple[Tensor, Tensor]:

@@ -69,11 +69,11 @@ class BoardProblem:
         of all valid corners.
         """
         eye = torch.eye(3, dtype=self.points.dtype, device=self.points.device)
-        right = torch.cat([eye.expand(*self.points.shape, 3), self.points[..., None]], dim=-1)
-        right = torch.where(self.valid[..., None, None], right, 0.0)
+        eye = eye.reshape(3, 3, *(1,) * self.valid.ndim).expand(3, 3, *self.valid.shape)
+        right = torch.cat([eye, self.points.movedim(-1, 0)[:, None]], dim=1)
+        whitened = forward_substitute(self.noise_chol.movedim((-2, -1), (0, 1)), right)
         # Whitener and whitened points as (*batch, boards, column, row, corner): corners side by side in memory.
-        whitened = forward_substitute(*(m.movedim((-2, -1), (0, 1)).contiguous() for m in (self.noise_chol, right)))
-        whitened = whitened.movedim((1, 0), (-3, -2))
+        whitened = torch.where(self.valid, whitened, 0.0).movedim((1, 0), (-3, -2))
         columns = self.points.new_empty(*whitened.shape[:-3], 13, *whitened.shape[-2:])
         columns[..., :3, :, :], columns[..., 12, :, :] = whitened[..., :3, :, :], whitened[..., 3, :, :]
         for k, component in enumerate(self.body_points.unbind(-1)):

@@ -20,7 +20,7 @@ from lsvision.stages.board_model import (
     squared_residuals,
     translations,
 )
-from lsvision.stages.motion_estimate import METHODS, CalibrationConfig, estimate, rmse
+from lsvision.stages.motion_estimate import METHODS, CalibrationConfig, estimate
 from lsvision.stages.observability import observe
 from lsvision.types import BoardCorners, BoardFit, Calibration, Iteration, Motion, Rig
 
@@ -130,7 +130,7 @@ def _solve(
         noisier = replace(problem, noise_chol=problem.noise_chol * scale.sqrt()[..., None, None, None, None])
         posterior = _merge(scale > 1, estimate(noisier, start, config), posterior)
     info = torch.where(sound, posterior.info, int(Info.SINGULAR))
-    return problem, posterior, scale, _summary(problem, start, replace(posterior, info=info), scale)
+    return problem, posterior, scale, _summary(problem, replace(posterior, info=info), scale)
 
 
 def _stacked(boards: Sequence[BoardCorners]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -243,29 +243,27 @@ def _merge(chosen: Tensor, one: Posterior, other: Posterior) -> Posterior:
     )
 
 
-def _summary(problem: BoardProblem, start: Tensor, posterior: Posterior, scale: Tensor) -> BatchCalibration:
+def _summary(problem: BoardProblem, posterior: Posterior, scale: Tensor) -> BatchCalibration:
     singular = posterior.info == int(Info.SINGULAR)
     state = torch.where(singular[..., None], torch.nan, posterior.mean)
     path = torch.where(singular[..., None], torch.nan, posterior.path)
+    squared, corners = squared_residuals(problem, path), problem.valid.sum(-1)
+    board_rmse = (squared / corners).sqrt()
     motion_factor = torch.where(singular[..., None, None], torch.nan, posterior.factor[..., -3:, :])
     return BatchCalibration(
         n=state[..., -3:],
         covariance=motion_factor @ motion_factor.mT,
         rotation=rotations(problem, state),
         translation_mm=translations(problem, state),
-        rmse_path_mm=rmse(problem, path),
+        rmse_path_mm=(squared.sum(-1) / corners.sum(-1)).sqrt(),
         n_path=path[..., -3:],
-        board_rmse_before_mm=_board_rmse(problem, torch.where(singular[..., None], torch.nan, start)),
-        board_rmse_after_mm=_board_rmse(problem, state),
+        board_rmse_before_mm=board_rmse[0],
+        board_rmse_after_mm=board_rmse[-1],
         noise_scale=torch.where(singular, torch.nan, scale),
         iterations=posterior.iterations,
         converged=posterior.converged & ~singular,
         info=posterior.info,
     )
-
-
-def _board_rmse(problem: BoardProblem, state: Tensor) -> Tensor:
-    return (squared_residuals(problem, state) / problem.valid.sum(-1)).sqrt()
 
 
 def _iterations(batch: BatchCalibration) -> tuple[Iteration, ...]:
