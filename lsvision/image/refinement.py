@@ -9,14 +9,14 @@ import torch.nn.functional as F  # noqa: N812
 from jaxtyping import Float, Shaped
 from torch import Tensor
 
-# Lines worked on at once: the two dozen intermediate images then stay in the processor's cache.
-_BAND = 64
+# Worked on at once: the two dozen intermediate images then stay in the processor's cache.
+_TILE_LINES, _TILE_COLUMNS = 96, 1024
 _SAME_SURFACE_PX = 0.5  # from a window's mean
 _ROUNDING = 1.0 / 6.0  # variance of the difference of two whole grey values
 # Variance of half the difference of two neighbours over that of the residual: half a pixel's noise, over one pixel's
 # and that of another which interpolation has smoothed to 0.6 of it on average.
 _SLOPE_NOISE = 0.5 / 1.6
-_NOISE_RESIDUAL = 2.0  # times the noise of one image; that of two is 1.4
+_NOISE_RESIDUAL = 4.0  # times the noise's variance in one image; two have twice of it
 
 
 @dataclass(frozen=True)
@@ -57,29 +57,40 @@ def refine_disparity(
 
     Source: Lucas & Kanade 1981, in one dimension; Baker & Matthews 2004 for the slope of the image that is not warped.
     """
-    lines, reach = left.shape[0], 2 * iterations * (window // 2)
+    (lines, width), reach = disparity.shape, 2 * iterations * (window // 2)
     refined, sigma = torch.empty_like(disparity), torch.empty_like(disparity)
     scatter, largest = _scatter_gain(window, iterations), largest_sigma_px or math.inf
-    for start in range(0, lines, _BAND):
-        stop = min(start + _BAND, lines)
-        above, below = max(start - reach, 0), min(stop + reach, lines)
+    for above, start, stop, below in _tiles(lines, _TILE_LINES, reach):
         pair = left[above:below].to(disparity.dtype), right[above:below].to(disparity.dtype)
-        current, deviation, residual = _refine_band(pair, disparity[above:below], window, iterations, noise)
-        inner, band = slice(start - above, stop - above), slice(start, stop)
-        torch.mul(deviation[inner], scatter, out=sigma[band])
-        change = (current[inner] - disparity[band]).abs_()
-        torch.where(change <= largest_change_px, current[inner], disparity[band], out=refined[band])
-        dropped = (sigma[band] > largest) & (residual[inner] > _NOISE_RESIDUAL * noise)
-        for values in (refined, sigma):
-            values[band].masked_fill_(dropped, torch.nan)
+        for before, first, last, after in _tiles(width, _TILE_COLUMNS, reach):
+            tile = slice(start, stop), slice(first, last)
+            inner = slice(start - above, stop - above), slice(first - before, last - before)
+            outer = disparity[above:below, before:after]
+            current, deviation, residual = (
+                values[inner] for values in _refine_tile(pair, outer, before, window, iterations, noise)
+            )
+            torch.mul(deviation, scatter, out=sigma[tile])
+            torch.add(disparity[tile], _small(current - disparity[tile], largest_change_px), out=refined[tile])
+            dropped = (sigma[tile] > largest) & (residual > _NOISE_RESIDUAL * noise**2)
+            for values in (refined, sigma):
+                values[tile].masked_fill_(dropped, torch.nan)
     return RefinedDisparity(refined, sigma)
 
 
-def _refine_band(
-    pair: tuple[Tensor, Tensor], disparity: Tensor, window: int, iterations: int, noise: float
+def _tiles(length: int, size: int, reach: int) -> list[tuple[int, int, int, int]]:
+    """Tiles of a line of pixels: beginning with its margin, beginning, end, end with its margin."""
+    starts = range(0, length, size)
+    return [(max(s - reach, 0), s, min(s + size, length), min(s + size + reach, length)) for s in starts]
+
+
+def _refine_tile(
+    pair: tuple[Tensor, Tensor], disparity: Tensor, column: int, window: int, iterations: int, noise: float
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Refined disparity, the standard deviation of one least-squares step, and the rms residual."""
-    left, right = pair
+    """Refined disparity, the standard deviation of one least-squares step, and the residual's variance.
+
+    The disparity begins at ``column`` of the images, which are whole: a partner may lie anywhere.
+    """
+    left, right = pair[0][:, column : column + disparity.shape[1]], pair[1]
     missing = disparity - disparity  # NaN where there is none
     known = (missing == 0).to(left.dtype)
     current = torch.nan_to_num(disparity)
@@ -94,7 +105,7 @@ def _refine_band(
     energy = texture + prior
     for _ in range(iterations):
         current = _smoothed(current, known, count, window)
-        residual = (left - _warp_rows(right, current)).mul_(known)
+        residual = (left - _warp_rows(right, current, column)).mul_(known)
         mean_residual = _window_sum(residual, window).div_(count)
         pull = _window_sum(slope * residual, window).div_(count).addcmul_(mean_slope, mean_residual, value=-1)
         step = pull / energy
@@ -104,7 +115,7 @@ def _refine_band(
     # The slope's own noise looks like texture but holds nothing.
     held = texture.sub_(unexplained, alpha=_SLOPE_NOISE).clamp_(min=0).add_(prior)
     sigma = (unexplained * energy.clamp_(min=0)).div_(count).sqrt_().div_(held)
-    return current.add_(missing), sigma.add_(missing), unexplained.sqrt_()
+    return current.add_(missing), sigma.add_(missing), unexplained
 
 
 def _smoothed(current: Tensor, known: Tensor, count: Tensor, window: int) -> Tensor:
@@ -113,7 +124,12 @@ def _smoothed(current: Tensor, known: Tensor, count: Tensor, window: int) -> Ten
     The windows warp each pixel by its own disparity, which follows slanted ground; its noise would stay, however.
     """
     change = _window_sum(current * known, window) / count - current
-    return current + change * (change.abs() < _SAME_SURFACE_PX)
+    return current + _small(change, _SAME_SURFACE_PX)
+
+
+def _small(change: Tensor, limit: float) -> Tensor:
+    """Changes up to a limit; zero for larger ones."""
+    return change - F.hardshrink(change, limit)
 
 
 def _scatter_gain(window: int, iterations: int) -> float:
@@ -133,10 +149,10 @@ def _scatter_gain(window: int, iterations: int) -> float:
     return float((result.square().mean() / smoothing.square().mean()).sqrt())
 
 
-def _warp_rows(image: Tensor, disparity: Tensor) -> Tensor:
-    """Values of an image at u - disparity along each line, by Catmull-Rom interpolation."""
-    width = image.shape[1]
-    position = (torch.arange(width, dtype=disparity.dtype) - disparity).clamp_(1.0, width - 2.0)
+def _warp_rows(image: Tensor, disparity: Tensor, column: int = 0) -> Tensor:
+    """Values of an image at u - disparity along each line, u from ``column`` on, by Catmull-Rom interpolation."""
+    width, stop = image.shape[1], column + disparity.shape[1]
+    position = (torch.arange(column, stop, dtype=disparity.dtype) - disparity).clamp_(1.0, width - 2.0)
     base = position.floor().clamp_(max=width - 3)
     t = position - base
     index = base.long()

@@ -16,7 +16,7 @@ _OFFSET, _CONTRAST = 5, 14
 # The plain saddle b + g (u, v) + c E1 E2 comes first: it has few minima, the full model then starts inside its own.
 _PLAIN = [0, 1, _ANGLE_1, _ANGLE_2, _BLUR, 5, 6, 7, _CONTRAST]
 _FULL = list(range(_PARAMETERS))
-_SMALLEST_STEP_PX = 1e-6  # shorter steps change nothing that is measured
+_SMALLEST_STEP_PX = 1e-5  # shorter steps change nothing that is measured
 
 
 @dataclass(frozen=True)
