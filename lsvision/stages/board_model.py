@@ -90,7 +90,7 @@ class BoardProblem:
     @cached_property
     def noise_log_det(self) -> Float[Tensor, "*batch"]:
         """Log-determinant of the covariance of all valid corners' points."""
-        by_corner = self.noise_chol.diagonal(dim1=-2, dim2=-1).log().sum(-1)
+        by_corner = self.noise_chol.diagonal(dim1=-2, dim2=-1).prod(-1).log()
         return 2 * torch.where(self.valid, by_corner, 0.0).sum((-2, -1))
 
 

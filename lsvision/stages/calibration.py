@@ -202,13 +202,17 @@ def _sound_problem(
     """The problem, its start, and which of the batch are sound; the others are replaced by a harmless stand-in."""
     sound = ~reduce(torch.logical_or, _flaws(points, covariance, board_points, valid).values()).any(-1)
     keep, seen = sound[..., None, None], valid & sound[..., None, None]
+    # Factored as few times as it was given: boards of one batch mostly share their noise.
+    chol = torch.linalg.cholesky_ex(covariance).L.expand(*points.shape, 3)
+    if bool(seen.all()):  # nothing to stand in for, and nothing to copy
+        problem, start = nominal_problem(points, chol, board_points.expand(points.shape), seen, pitch)
+        return problem, start, sound
     index = torch.arange(points.shape[-2], dtype=points.dtype, device=points.device)
     stand_in = torch.stack([index, index * index, torch.zeros_like(index)], dim=-1)
     eye = torch.eye(3, dtype=points.dtype, device=points.device)
     points = torch.where(seen[..., None], points, torch.where(keep[..., None], 0.0, stand_in))
     board_points = torch.where(seen[..., None], board_points, torch.where(keep[..., None], 0.0, stand_in))
-    # Factored as few times as it was given: boards of one batch mostly share their noise.
-    chol = torch.where(seen[..., None, None], torch.linalg.cholesky_ex(covariance).L, eye)
+    chol = torch.where(seen[..., None, None], chol, eye)
     problem, start = nominal_problem(points, chol, board_points, seen | ~keep, pitch)
     return problem, start, sound
 
