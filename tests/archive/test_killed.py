@@ -182,9 +182,11 @@ def test_the_scheduler(archive, undisturbed, tmp_path, cluster):
 def test_two_runs_at_once(archive, undisturbed, tmp_path):
     first = start(archive, tmp_path / "o")
     wait_for(first, tmp_path / "o", 1)
+    first.send_signal(signal.SIGSTOP)  # held at work while the second starts, however slow the machine
     second = start(archive, tmp_path / "o")
-    output, _ = second.communicate(timeout=60)
-    assert second.returncode == 1
+    output, _ = second.communicate(timeout=120)
+    first.send_signal(signal.SIGCONT)
+    assert second.returncode == 1, output
     assert "error: output: another run is working on" in output
     finish(first)
     assert_whole(tmp_path / "o", undisturbed)
