@@ -94,8 +94,9 @@ def _bound(corners: ExactCorners, conditions: Conditions) -> Tensor:
 
 
 def _means(own: polars.DataFrame, solved: polars.DataFrame) -> dict[str, float]:
-    names = ("rmse_before_mm", "rmse_after_mm", "nees", "noise_scale", "iterations", "converged", "prior_dominated")
-    means = solved.select(polars.col(names).cast(polars.Float64).mean()).row(0, named=True)
+    names = ("rmse_before_mm", "rmse_after_mm", "nees", "noise_scale", "converged", "prior_dominated")
+    used = polars.col("iterations").cast(polars.Float64).mean().alias("iterations_used")
+    means = solved.select(polars.col(names).cast(polars.Float64).mean(), used).row(0, named=True)
     return {**means, "failed": float(own["failed"].to_numpy().mean())}
 
 

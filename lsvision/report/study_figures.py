@@ -30,7 +30,7 @@ AXIS_LABELS = {
     "tilt_spread_deg": "largest angle between two boards [deg]",
 }
 _COMPONENTS = ("n1, sideways", "n2, along", "n3, in depth")
-_MOST_CURVES = 8
+_MOST_CURVES = len(COLORS)
 _MARKERS = "osD^vP*X"
 _FEW_STEPS = 8  # iterations over which the contraction of a slow method is told
 _SHARES = (0.002, 0.005, 0.01, 0.02, 0.05, 0.5)  # of the prior's sigma, where the map has a contour
@@ -73,7 +73,12 @@ def accuracy(points: polars.DataFrame, axis: str, others: tuple[str, ...]) -> Re
         "have (dashed, or a bar). Where they meet only better corners or other boards help; where the error stands "
         "above, something disturbs the corners that the calibration does not know of, or it was stopped too early."
     )
-    return ReportFigure(f"accuracy_{axis}", f"Accuracy against {AXIS_LABELS[axis].split(' [')[0]}", caption, figure)
+    return ReportFigure(
+        f"accuracy_{axis}",
+        f"Accuracy against {AXIS_LABELS[axis].split(' [')[0]}",
+        caption + _left_out(points, others),
+        figure,
+    )
 
 
 def placings(points: polars.DataFrame) -> ReportFigure:
@@ -104,7 +109,8 @@ def convergence(iterations: polars.DataFrame, points: polars.DataFrame, others: 
     """RMSE by iteration: median and 5..95 % of the runs, one curve for each combination of conditions."""
     figure, (axes,) = new_figure(8.5, 4.8)
     for style, (label, own) in enumerate(_curves(points, others)):
-        path = iterations.filter(polars.col("point") == own["point"][0])
+        longest = iterations.filter(polars.col("point").is_in(own["point"].to_list())).sort("iteration")["point"][-1]
+        path = iterations.filter(polars.col("point") == longest)
         color = COLORS[style % len(COLORS)]
         label += _contraction(path["median"].to_list())
         axes.semilogy(path["iteration"], path["median"], _MARKERS[style], ls="-", ms=4, color=color, label=label)
@@ -116,7 +122,7 @@ def convergence(iterations: polars.DataFrame, points: polars.DataFrame, others: 
         "The joint estimate stands on the floor that the corners' noise leaves after two iterations. Alternating "
         "between poses and n takes off the share in the legend each time: stopped early, it is far from done."
     )
-    return ReportFigure("convergence", "How fast the methods converge", caption, figure)
+    return ReportFigure("convergence", "How fast the methods converge", caption + _left_out(points, others), figure)
 
 
 def truth_and_estimate(runs: polars.DataFrame, points: polars.DataFrame, others: tuple[str, ...]) -> ReportFigure:
@@ -157,7 +163,9 @@ def consistency(points: polars.DataFrame, band: tuple[float, float]) -> ReportFi
         (axes[0], "Efficiency", "rms error over Cramér-Rao bound [ratio]"),
         (axes[1], "Consistency", "mean normalised squared error [ratio]"),
     ):
-        panel.set_yscale("log")
+        low, high = panel.get_ylim()
+        if low > 0 and high / low > 5:
+            panel.set_yscale("log")
         label_axes(panel, title, "point of the study [index]", y)
         panel.xaxis.set_major_locator(MaxNLocator(integer=True))
     figure.legend(loc="outside lower center", ncols=2, fontsize=9)
@@ -200,6 +208,12 @@ def _curves(points: polars.DataFrame, others: tuple[str, ...]) -> Iterator[tuple
         return
     for key, own in list(points.group_by(*others, maintain_order=True))[:_MOST_CURVES]:
         yield ", ".join(_in_words(name, value) for name, value in zip(others, key, strict=True)), own
+
+
+def _left_out(points: polars.DataFrame, others: tuple[str, ...]) -> str:
+    """A caption's last words where a figure does not show every combination."""
+    count = points.select(others).unique().height if others else 1
+    return f" Shown are the first {_MOST_CURVES} of {count} combinations." if count > _MOST_CURVES else ""
 
 
 def _in_words(name: str, value: object) -> str:

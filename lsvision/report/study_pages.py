@@ -98,7 +98,7 @@ def _points_table(study: Study) -> Table:
             f"{row['nees']:.2f}",
             f"{row['rmse_before_mm']:.4f}",
             f"{row['rmse_after_mm']:.4f}",
-            f"{row['iterations']:.1f}",
+            f"{row['iterations_used']:.1f}",
             f"{100 * row['converged']:.0f} %",
             f"{100 * row['prior_dominated']:.0f} %",
         )

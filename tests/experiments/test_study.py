@@ -138,6 +138,14 @@ def test_two_steps_contract_slowly_and_the_joint_update_at_once(rig):
     assert table["converged"].to_list() == [1.0, 0.0]
 
 
+def test_iterations_allowed_and_used_are_told_apart(rig):
+    points = [dataclasses.replace(POINT, iterations=most) for most in (2, 20)]
+    _, table, _ = table_of(rig, points, runs=4)
+    assert table["iterations"].to_list() == [2, 20]
+    assert table["iterations_used"][0] == 2.0
+    assert 2.0 < table["iterations_used"][1] < 6.0
+
+
 def test_unknown_vibration_shows_in_error_and_noise_scale(rig):
     points = [POINT, dataclasses.replace(POINT, vibration_mm=0.3)]
     _, table, _ = table_of(rig, points, runs=40)
