@@ -41,6 +41,7 @@ def study_report(study: Study, settings: dict, folder: Path) -> None:
     points = study.points
     per_point = int(points["runs"][0])
     determined = points.filter(polars.col("prior_dominated") < 0.5)
+    finished = determined.filter(polars.col("converged") > 0.5)
     write_report(
         folder,
         title=study.title,
@@ -52,7 +53,7 @@ def study_report(study: Study, settings: dict, folder: Path) -> None:
         headlines=[
             Comparison("Determined", f"{len(determined)} of {len(points)} points", "the others repeat the prior on n"),
             Comparison(
-                "Error over bound", _median(determined, "error_over_bound"), "of the determined points; 1 is best"
+                "Error over bound", _median(finished, "error_over_bound"), "where determined and converged; 1 is best"
             ),
             Comparison("Converged", _share(points, "converged"), "of all calibrations"),
             Comparison("Failed", _share(points, "failed"), "of all calibrations"),

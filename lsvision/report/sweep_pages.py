@@ -41,7 +41,7 @@ def sweep_report(jobs: Sequence[SweepJob], folder: Path) -> None:
             Comparison("Results", str(len(done)), f"of {len(jobs)} jobs"),
             Comparison("Failed", str(len(failed)), "reasons below" if failed else "none"),
         ],
-        tables=[_results_table(done, varied), *([_failures_table(failed)] if failed else [])],
+        tables=[_results_table(done, varied), *([_failures_table(failed, varied)] if failed else [])],
         figures=figures,
         settings={job.name: job.overrides for job in jobs},
     )
@@ -63,9 +63,9 @@ def _results_table(jobs: Sequence[SweepJob], varied: Sequence[str]) -> Table:
     )
 
 
-def _failures_table(jobs: Sequence[SweepJob]) -> Table:
-    rows = [(job.name, " ".join(job.overrides), job.reason) for job in jobs]
-    return Table("Failed jobs", ("job", "options", "reason"), rows, "The log in the job's folder has the whole trace.")
+def _failures_table(jobs: Sequence[SweepJob], varied: Sequence[str]) -> Table:
+    rows = [(job.name, *(_given(job).get(name, "") for name in varied), job.reason) for job in jobs]
+    return Table("Failed jobs", ("job", *varied, "reason"), rows, "The log in the job's folder has the whole trace.")
 
 
 def _results_by_job(jobs: Sequence[SweepJob]) -> ReportFigure:
