@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from lsvision.image.saddle import SaddleFit, fit_saddles
+from lsvision.image.saddle_grid import find_saddle_grid
 from lsvision.types import Board, LineImage, TensorImage
 
 _REDUCED_WIDTH = 900  # columns in which the coarse search runs: squares of a full-field board still have 40 px
@@ -78,7 +79,8 @@ def find_grid(
 ) -> Float[Tensor, "rows columns 2"] | None:
     """Inner corners of a board as a grid of (u, v) px, columns along the longer side; None where none is seen.
 
-    The order along either side, and so the handedness, is left open: ``order_grid`` settles it.
+    Of a board that is partly hidden or beyond the image the grid continues where its corners would be. The order along
+    either side, and so the handedness, is left open: ``order_grid`` settles it.
     """
     if min(brightness.shape) < 2 * max(inner):
         return None
@@ -88,8 +90,8 @@ def find_grid(
     if not found:
         flags = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
         found, corners = cv2.findChessboardCorners(picture, inner, flags=flags)
-    if not found:
-        return None
+    if not found:  # both want every corner, and give up on some angles and shears
+        return find_saddle_grid(brightness, inner)
     # OpenCV 4 returns (N, 1, 2), OpenCV 5 (N, 2).
     points = torch.from_numpy(np.asarray(corners, dtype=np.float64).reshape(-1, 2))
     return points.reshape(inner[1], inner[0], 2)
@@ -198,7 +200,8 @@ def _pattern_score(grid: Tensor, brightness: Tensor) -> float:
     seen = F.grid_sample(smooth, normalised[None], align_corners=True)[0, 0]
     row, column = torch.meshgrid(torch.arange(seen.shape[0]), torch.arange(seen.shape[1]), indexing="ij")
     black = (row + column) % 2 == 0
-    return float(seen[~black].mean() - seen[black].mean())
+    inside = (normalised.abs() <= 1).all(-1)
+    return float(seen[~black & inside].mean() - seen[black & inside].mean())
 
 
 def _stretched_to_bytes(brightness: Tensor) -> np.ndarray:

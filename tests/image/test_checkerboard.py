@@ -2,8 +2,11 @@
 
 import dataclasses
 import json
+import math
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -121,6 +124,62 @@ def test_windows_beyond_the_image_are_invalid():
     assert detected.covariance[~detected.valid].isnan().all()
     expected = (corners - torch.tensor([float(left), 0.0])).reshape(-1, 2)[detected.valid]
     torch.testing.assert_close(detected.position[detected.valid], expected, rtol=0, atol=0.01)
+
+
+def test_smear_glare_and_dirt_cost_only_their_corners():
+    image, corners = drawn_board(ASYMMETRIC)
+    spoiled = image.clone()
+    for (row, column), box in (((1, 1), "glare"), ((2, 3), "smear"), ((3, 0), "dirt")):
+        u, v = (int(x) for x in corners[row, column].round())
+        patch = spoiled[v - 4 : v + 5, u - 4 : u + 5]
+        patch[:] = {"glare": 255, "smear": int(patch.float().mean()), "dirt": 20}[box]
+        if box == "smear":
+            patch[:] = image[v - 4, u - 4 : u + 5]
+    noisy = (spoiled + 2 * torch.randn(spoiled.shape)).clamp(0, 255).to(torch.uint8)
+    detected = refine_grid(TensorImage(noisy), corners)
+    spoilt = torch.zeros(corners.shape[:2], dtype=torch.bool)
+    spoilt[1, 1] = spoilt[2, 3] = spoilt[3, 0] = True
+    assert torch.equal(detected.valid, ~spoilt.reshape(-1))
+    error = (detected.position - corners.reshape(-1, 2))[detected.valid]
+    assert error.abs().max() < 0.05
+
+
+@pytest.mark.parametrize("yaw", [0.0, 37.0, 105.0, 200.0, 345.0])
+@pytest.mark.parametrize("stretch", [0.5, 1.0, 2.0])
+def test_any_angle_shear_and_stretch(stretch, yaw):
+    board = Board(12, 9, 30.0)
+    image, corners = drawn_board(board)
+    turn = math.radians(yaw)
+    matrix = np.array([[1.0, 0.15], [0.0, stretch]]) @ np.array(
+        [[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]]
+    )
+    matrix = 1.5 * matrix
+    rim = np.array([[0, 0], [image.shape[1], 0], [0, image.shape[0]], [image.shape[1], image.shape[0]]]) @ matrix.T
+    shift = 10 - rim.min(0)
+    size = tuple(int(n) for n in np.ceil(np.ptp(rim, axis=0)) + 20)
+    warped = cv2.warpAffine(
+        image[..., 0].numpy(), np.c_[matrix, shift], size, flags=cv2.INTER_CUBIC, borderValue=(220,)
+    )
+    noisy = torch.from_numpy(warped)[..., None] + 2 * torch.randn(*warped.shape, 1)
+    detected = detect_board(TensorImage(noisy.clamp(0, 255).to(torch.uint8)), board)
+    truth = corners.reshape(-1, 2) @ torch.from_numpy(matrix).mT + torch.from_numpy(shift)
+    assert detected is not None
+    assert detected.valid.float().mean() > 0.95
+    assert (detected.position - truth)[detected.valid].square().mean().sqrt() < 0.1
+
+
+def test_a_board_partly_beyond_the_image():
+    board = Board(12, 9, 30.0)
+    image, corners = drawn_board(board)
+    left = int(corners[0, 3, 0]) - 6  # three columns of corners are cut off, a fourth stands at the rim
+    detected = detect_board(TensorImage(image[:, left:].contiguous()), board)
+    assert detected is not None
+    found = detected.position.reshape(8, 11, 2)[detected.valid.reshape(8, 11)]
+    assert len(found) >= 56
+    # It may count from another square; each corner found is one of the board's.
+    distance = torch.cdist(found, corners.reshape(-1, 2) - torch.tensor([float(left), 0.0]).double())
+    assert distance.amin(1).max() < 0.02
+    assert len(distance.argmin(1).unique()) == len(found)
 
 
 def test_a_poor_start_is_refined_and_a_wrong_one_refused():
