@@ -29,6 +29,8 @@ from lsvision.geometry import displace, fit_rigid, rotation_from_vector, scan_po
 # Spread, rad and mm, of cubature points that stand for one point: the model there is its tangent to ten digits.
 POINT_SPREAD = 1e-6
 
+# Boards whose whitened corners are reduced at once: some 2 MB, as much as stays near a processor.
+_BOARDS_IN_CACHE = 64
 _LATENTS = 3  # of the error of a board's linearised rotation
 
 
@@ -68,18 +70,11 @@ class BoardProblem:
         For a map c, its three values at 1, then those at each component of p, ‖q - S c‖² is the squared whitened error
         of all valid corners.
         """
-        eye = torch.eye(3, dtype=self.points.dtype, device=self.points.device)
-        eye = eye.reshape(3, 3, *(1,) * self.valid.ndim).expand(3, 3, *self.valid.shape)
-        right = torch.cat([eye, self.points.movedim(-1, 0)[:, None]], dim=1)
-        whitened = forward_substitute(self.noise_chol.movedim((-2, -1), (0, 1)), right)
-        # Whitener and whitened points as (*batch, boards, column, row, corner): corners side by side in memory.
-        whitened = torch.where(self.valid, whitened, 0.0).movedim((1, 0), (-3, -2))
-        columns = self.points.new_empty(*whitened.shape[:-3], 13, *whitened.shape[-2:])
-        columns[..., :3, :, :], columns[..., 12, :, :] = whitened[..., :3, :, :], whitened[..., 3, :, :]
-        for k, component in enumerate(self.body_points.unbind(-1)):
-            by_point = columns[..., 3 + 3 * k : 6 + 3 * k, :, :]
-            torch.mul(whitened[..., :3, :, :], component[..., None, None, :], out=by_point)
-        return upper_root(columns.flatten(-2).mT)
+        parts = (self.noise_chol, self.points, self.body_points, self.valid)
+        if self.valid.ndim < 3:
+            return _affine_rows(*parts)
+        step = max(1, _BOARDS_IN_CACHE // self.boards)
+        return torch.cat([_affine_rows(*pieces) for pieces in zip(*(part.split(step) for part in parts), strict=True)])
 
     @cached_property
     def residual_rows(self) -> Float[Tensor, "*batch boards 7 7"]:
@@ -197,6 +192,23 @@ def translations(problem: BoardProblem, state: Float[Tensor, "*batch state"]) ->
     """Translations T of the boards, mm: where the board frames' origins lie."""
     position = split_state(state)[1]
     return position - apply(rotations(problem, state), problem.centroid)
+
+
+def _affine_rows(noise_chol: Tensor, points: Tensor, body_points: Tensor, valid: Tensor) -> Tensor:
+    """``BoardProblem.affine_rows`` of some of a batch."""
+    eye = torch.eye(3, dtype=points.dtype, device=points.device)
+    eye = eye.reshape(3, 3, *(1,) * valid.ndim).expand(3, 3, *valid.shape)
+    right = torch.cat([eye, points.movedim(-1, 0)[:, None]], dim=1)
+    whitened = forward_substitute(noise_chol.movedim((-2, -1), (0, 1)), right)
+    # Whitener and whitened points as (*batch, boards, column, row, corner): corners side by side in memory.
+    whitened = torch.where(valid, whitened, 0.0).movedim((1, 0), (-3, -2))
+    columns = points.new_empty(*whitened.shape[:-3], 13, *whitened.shape[-2:])
+    columns[..., :3, :, :], columns[..., 12, :, :] = whitened[..., :3, :, :], whitened[..., 3, :, :]
+    for k, component in enumerate(body_points.unbind(-1)):
+        by_point = columns[..., 3 + 3 * k : 6 + 3 * k, :, :]
+        torch.mul(whitened[..., :3, :, :], component[..., None, None, :], out=by_point)
+    # In one layout whatever comes before: the order of sums, and so their last bits, follows it.
+    return upper_root(columns.flatten(-2).mT).contiguous()
 
 
 def _affine_model(problem: BoardProblem, mean: Tensor, factor: Tensor) -> Tensor:
