@@ -9,7 +9,7 @@ _NOBODY = 1e9
 
 
 def agreeing(
-    disparity: Float[Tensor, "lines width"], cost: Float[Tensor, "lines width"], limit_px: int
+    disparity: Float[Tensor, "lines width"], cost: Float[Tensor, "lines width"], limit_px: float
 ) -> Float[Tensor, "lines width"]:
     """Disparity without the pixels whose partner in the right image fits another pixel better.
 

@@ -79,7 +79,7 @@ def match_coarse_to_fine(
         better = behind_cost < cost[:, columns]
         disparity[:, columns] = torch.where(better, behind, disparity[:, columns])
         cost[:, columns] = torch.minimum(behind_cost, cost[:, columns])
-    disparity = agreeing(_without_speckles(disparity, speckle_px), cost, check)
+    disparity = agreeing(_without_speckles(disparity, speckle_px), cost, fine_check_px / 2)
     disparity = refine_disparity(half_left, half_right, disparity, window=9, iterations=1, noise=noise).disparity
     return _full_size(disparity, lines, width, minimum_px, maximum_px)
 
