@@ -20,9 +20,9 @@ from lsvision.archive.tasks import (
     VerifyProduct,
     Work,
     create_depth_store,
+    is_finished,
 )
-from lsvision.errors import FileFormatError
-from lsvision.io import ProductLayout, create_product, read_product, read_scan
+from lsvision.io import ProductLayout, create_product, read_scan
 from lsvision.types import Scan
 
 WORK_FOLDER = ".work"
@@ -66,7 +66,7 @@ def scan_job(planned: PlannedScan, place: Place) -> Job:
     if not _is_renamed(planned, place, product, target, strips_key):
         yield _correcting(planned, place, depth, product, strips_key)
         measured = sum(strip.measured for strip in place.ledger.done(planned.key, "product", strips_key).values())
-        yield [Task(planned.key, FinishProduct(str(product), str(target), measured, place.verify))]
+        yield [Task(planned.key, FinishProduct(str(product), str(target), strips_key, measured, place.verify))]
     for other in work.iterdir():
         if other != depth:
             shutil.rmtree(other, ignore_errors=True)
@@ -123,10 +123,7 @@ def _is_renamed(planned: PlannedScan, place: Place, product: Path, target: Path,
     count = -(-planned.grid.rows // planned.correction.strip_rows)
     if product.is_dir() or len(place.ledger.done(planned.key, "product", key)) < count:
         return False
-    try:
-        return read_product(target).metadata.get("key") == key
-    except FileFormatError:
-        return False
+    return is_finished(target, key)
 
 
 def _layout(planned: PlannedScan, place: Place, scan: Scan, key: str) -> ProductLayout:

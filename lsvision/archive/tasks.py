@@ -20,7 +20,16 @@ import zarr
 from zarr.codecs import ZstdCodec
 
 from lsvision.errors import FileFormatError, LsvisionError
-from lsvision.io import ProductRows, check_product, complete_product, open_line_image, read_scan, scan_sha256
+from lsvision.io import (
+    ProductRows,
+    check_product,
+    complete_product,
+    open_line_image,
+    read_product,
+    read_scan,
+    remove_left_over,
+    scan_sha256,
+)
 from lsvision.stages.correction import CorrectionConfig, correct_rows, plan_product
 from lsvision.stages.disparity import DisparityConfig, MatchedDepth
 from lsvision.types import LineImage, Motion, Scan
@@ -117,16 +126,20 @@ class CorrectStrip:
 class FinishProduct:
     """Gives a product whose strips are all written its final name, after reading it back where asked to.
 
-    ``measured`` is the number of valid cells that its strips were written with.
+    ``key`` is the one in its metadata, ``measured`` the number of valid cells that its strips were written with.
     """
 
     product: str
     target: str
+    key: str
     measured: int
     verify: bool
 
     def run(self) -> TaskResult:
         """Take away what killed workers left, check, rename."""
+        remove_left_over(self.target)
+        if not Path(self.product).is_dir() and is_finished(self.target, self.key):
+            return TaskResult()  # by a worker that died before it could say so
         for left_over in Path(self.product).rglob("*.partial"):
             left_over.unlink(missing_ok=True)
         if self.verify and (damage := damage_of(self.product, self.measured)):
@@ -192,6 +205,14 @@ def create_depth_store(path: Path, lines: int, width: int, strip_lines: int, *, 
             compressors=[ZstdCodec(level=1, checksum=True)],
         )
     partial.rename(path)
+
+
+def is_finished(target: Path | str, key: str) -> bool:
+    """Whether the product of this key has its final name already."""
+    try:
+        return read_product(target).metadata.get("key") == key
+    except FileFormatError:
+        return False
 
 
 def damage_of(path: str, measured: int) -> str:

@@ -1,6 +1,6 @@
 """Files: rig, scan, calibration and product; read by line ranges, checked on reading, complete under a final name."""
 
-from lsvision.io.atomic import write_text
+from lsvision.io.atomic import remove_left_over, write_text
 from lsvision.io.calibration import check_rig_match, read_calibration, write_calibration
 from lsvision.io.checksum import scan_sha256
 from lsvision.io.encoder import read_encoder, write_encoder
@@ -33,6 +33,7 @@ __all__ = [
     "read_product",
     "read_rig",
     "read_scan",
+    "remove_left_over",
     "rig_from_dict",
     "rig_to_dict",
     "scan_sha256",

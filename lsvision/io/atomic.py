@@ -1,6 +1,7 @@
 """Writing aside and renaming when complete: a final name never holds half a result."""
 
 import errno
+import glob
 import os
 import shutil
 import uuid
@@ -68,6 +69,13 @@ def replace_folder(source: Path | str, target: Path | str, *, marker: str) -> No
     _check_replaceable(target, marker)
     target.parent.mkdir(parents=True, exist_ok=True)
     _take_over(Path(source), target)
+
+
+def remove_left_over(target: Path | str) -> None:
+    """Remove what killed writers of ``target`` left beside it; for the only one who writes it now."""
+    target = Path(target).resolve()
+    for left_over in target.parent.glob(f".{glob.escape(target.name)}.*.partial"):
+        shutil.rmtree(left_over, ignore_errors=True)
 
 
 def write_text(path: Path | str, text: str) -> None:

@@ -10,7 +10,7 @@ import torch
 import zarr
 
 from lsvision.archive import LEDGER_FILE, Ledger
-from lsvision.archive.tasks import CorrectStrip, HashInput, MatchStrip
+from lsvision.archive.tasks import CorrectStrip, HashInput, MatchStrip, run_task
 from lsvision.io import read_calibration, read_product, read_scan
 from lsvision.stages.correction import correct_scan
 from lsvision.stages.disparity import depth_of
@@ -72,6 +72,32 @@ def test_uncertainty_is_that_of_the_bare_stages(archive, calibration, tmp_path):
     assert bool(torch.isfinite(sigma).any())
     stored = np.moveaxis(zarr.open_array(tmp_path / "o" / "b.zarr" / "sigma" / "0", mode="r")[:], 0, -1)
     np.testing.assert_array_equal(stored, sigma.numpy())
+
+
+def test_tasks_that_run_twice_do_no_harm(archive, calibration, undisturbed, tmp_path):
+    class Twice(InProcess):
+        """The first worker at every task dies before it can say what it did."""
+
+        def collect(self):
+            run_task(self._waiting[-1])
+            return super().collect()
+
+    shutil.copytree(undisturbed, tmp_path / "o")
+    other = make_calibration(tmp_path / "other.json", (-0.01, 1.01, 0.02))
+    process(archive, other, tmp_path / "o", Twice())
+    rows, _ = process(archive, calibration, tmp_path / "o", Twice())
+    assert {row.status for row in rows} == {"done"}
+    assert_same_products(undisturbed, tmp_path / "o")
+
+
+def test_what_killed_writers_left_beside_a_product_goes_with_the_next(archive, calibration, undisturbed, tmp_path):
+    shutil.copytree(undisturbed, tmp_path / "o")
+    retired, other = tmp_path / "o" / ".a.zarr.0123.partial", tmp_path / "o" / ".ba.zarr.0123.partial"
+    retired.mkdir()
+    other.mkdir()
+    process(archive, make_calibration(tmp_path / "other.json", (-0.01, 1.01, 0.02)), tmp_path / "o")
+    assert not retired.exists()
+    assert other.exists()
 
 
 @pytest.mark.parametrize("rows", [16, 512])
