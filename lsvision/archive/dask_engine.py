@@ -16,12 +16,16 @@ from lsvision.errors import ConfigError, LsvisionError
 
 _LOOK_SECONDS = 1.0
 
-# Tasks wait at the scheduler, not at a worker: the death of one says something of its own task alone.
+# Tasks wait at the scheduler, not at a worker: the death of one says something of its own task alone. A local worker
+# loads what tasks need before it takes one, so that no task answers for that time.
 _SETTINGS = {
+    "distributed.worker.preload": ["lsvision.archive.tasks"],
     "distributed.scheduler.allowed-failures": MOST_DEATHS - 1,
     "distributed.scheduler.worker-saturation": 1.0,
     "distributed.comm.timeouts.connect": "10s",
 }
+# What matters of workers that come and go is in the results.
+_LOGGERS = ("distributed", "distributed.client", "tornado.application")
 
 
 class DaskEngine:
@@ -40,7 +44,8 @@ class DaskEngine:
         self._done: SimpleQueue[Future] = SimpleQueue()
         self._tasks: dict[Future, Task] = {}
         self._settings = dask.config.set(_SETTINGS)
-        logging.getLogger("distributed").setLevel(logging.CRITICAL)  # what matters of it is in the results
+        for name in _LOGGERS:
+            logging.getLogger(name).setLevel(logging.CRITICAL)
         self._cluster, self._workers = None, workers
         if scheduler is None:
             self._cluster = LocalCluster(

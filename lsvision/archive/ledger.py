@@ -55,7 +55,7 @@ class ScanRow:
 class StripRow:
     """One strip of one stage of a scan: done for ``key``, the hash of all that it depends on, or failed.
 
-    ``measured`` counts the cells with a value, ``runs`` how often the strip was computed for this key.
+    ``measured`` counts the cells with a value, ``runs`` how often the strip was done for this key.
     """
 
     scan: str
@@ -124,7 +124,8 @@ class Ledger:
 
     def put_strip(self, row: StripRow) -> None:
         """Write a strip's row; a strip that was done for the same key before counts one run more."""
-        counted = "runs = CASE WHEN strips.key = excluded.key THEN strips.runs + 1 ELSE 1 END"
+        again = "strips.key = excluded.key AND strips.status = 'done'"
+        counted = f"runs = CASE WHEN {again} THEN strips.runs + 1 ELSE 1 END"
         self._db.execute(_upsert("strips", StripRow).replace("runs = excluded.runs", counted), asdict(row))
 
     def forget_strips(self, scan: str, stage: Stage) -> None:
