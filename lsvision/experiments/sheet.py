@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from lsvision.geometry import displace, fit_rigid, line_at, product_axes, project, scan_position, transform, travel_at
-from lsvision.image.checkerboard import gray
+from lsvision.image.brightness import gray
 from lsvision.image.planes import fit_local_planes
 from lsvision.simulation import SceneConfig, Simulation, artwork
 from lsvision.stages.correction import ProductGrid

@@ -9,6 +9,7 @@ import torch.nn.functional as F  # noqa: N812
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from lsvision.image.brightness import gray, gray_bytes
 from lsvision.image.saddle import SaddleFit, fit_saddles
 from lsvision.image.saddle_grid import find_saddle_grid
 from lsvision.types import Board, LineImage, TensorImage
@@ -30,15 +31,6 @@ class DetectedCorners:
     valid: Bool[Tensor, " corners"]
 
 
-def gray(lines: Tensor) -> Float[Tensor, "*batch lines width"]:
-    """Brightness, luma of ITU-R BT.601, of ``(*batch, lines, width, 1 or 3)`` values of any type, float32, unscaled."""
-    values = lines.to(torch.float32)
-    if values.shape[-1] == 1:
-        return values[..., 0]
-    flat = values[..., :3].reshape(-1, values.shape[-2], 3)
-    return torch.from_numpy(cv2.cvtColor(flat.numpy(), cv2.COLOR_RGB2GRAY)).reshape(values.shape[:-1])
-
-
 def detect_board(image: LineImage, board: Board, *, mirrored: bool = False) -> DetectedCorners | None:
     """Find a board in an image of any length and locate its inner corners.
 
@@ -57,21 +49,25 @@ def detect_board(image: LineImage, board: Board, *, mirrored: bool = False) -> D
     ordered = order_grid(grid, reduced, mirrored=mirrored)
     if factor > 1:
         # A tenth of a pixel of the copy is already a pixel of the image; the fit of the copy is better than that.
-        coarse = refine_grid(TensorImage(reduced[..., None]), ordered, largest_radius=8)
+        coarse = refine_grid(TensorImage(reduced[..., None]), ordered, largest_radius=6, plain=True)
         ordered = torch.where(coarse.valid[:, None], coarse.position, ordered.reshape(-1, 2)).reshape(ordered.shape)
     return refine_grid(image, (ordered + 0.5) * factor - 0.5)
 
 
 def reduce_image(image: LineImage, factor: int) -> Float[Tensor, "lines width"]:
-    """Brightness of an image averaged over blocks of ``factor x factor`` px; an incomplete last block is left out."""
+    """Brightness of an image averaged over blocks of ``factor x factor`` px; an incomplete last block is left out.
+
+    Of an image of bytes it is in whole grey values: what that rounds off is less than their noise.
+    """
     lines, width, _ = image.shape
     kept = width - width % factor
     blocks = []
     step = max(factor, _REDUCE_LINES - _REDUCE_LINES % factor)
     for start in range(0, lines - lines % factor, step):
         stop = min(start + step, lines - lines % factor)
-        blocks.append(F.avg_pool2d(gray(image.read(start, stop))[None, :, :kept], factor)[0])
-    return torch.cat(blocks) if blocks else torch.zeros(0, kept // factor)
+        whole = (gray_bytes if image.dtype == torch.uint8 else gray)(image.read(start, stop))[:, :kept].numpy()
+        blocks.append(cv2.resize(whole, None, fx=1 / factor, fy=1 / factor, interpolation=cv2.INTER_AREA))
+    return torch.from_numpy(np.concatenate(blocks)).float() if blocks else torch.zeros(0, kept // factor)
 
 
 def find_grid(
@@ -110,21 +106,21 @@ def order_grid(
     right_handed = bool(x[0] * y[1] - x[1] * y[0] > 0)
     if right_handed == mirrored:
         grid = grid.flip(0)
-    score = _pattern_score(grid, brightness)
+    smooth = torch.from_numpy(cv2.blur(brightness.numpy(), (3, 3)))
     turned = grid.flip(0, 1)
-    turned_score = _pattern_score(turned, brightness)
+    score, turned_score = _pattern_score(grid, smooth), _pattern_score(turned, smooth)
     if abs(score - turned_score) < 1e-6 * (abs(score) + abs(turned_score)):
         return grid if bool(x[0] >= 0) else turned
     return grid if score > turned_score else turned
 
 
 def refine_grid(
-    image: LineImage, grid: Float[Tensor, "rows columns 2"], *, largest_radius: int = 13
+    image: LineImage, grid: Float[Tensor, "rows columns 2"], *, largest_radius: int = 13, plain: bool = False
 ) -> DetectedCorners:
     """Locate corners at full size, from a grid good to about two pixels: one batch of windows, fitted together.
 
     A window reaches into the four squares around its corner, at any angle, shear and stretch, and at most
-    ``largest_radius`` px: past it the board's own texture weighs more than what is gained.
+    ``largest_radius`` px: past it the board's own texture weighs more than what is gained. A ``plain`` fit is a start.
     """
     points = grid.reshape(-1, 2)
     along_x, along_y = _neighbour_vectors(grid)
@@ -135,7 +131,7 @@ def refine_grid(
     mask = _within_squares(torch.stack([along_x, along_y], dim=-1), radius)
     # The edge along X has its normal a quarter turn from the tangent along X.
     angles = torch.stack([torch.atan2(d[:, 1], d[:, 0]) + torch.pi / 2 for d in (along_x, along_y)], dim=-1)
-    fit = fit_saddles(windows, angles.to(windows), mask)
+    fit = fit_saddles(windows, angles.to(windows), mask, plain=plain)
     return _detected(fit, centre, inside)
 
 
@@ -196,8 +192,7 @@ def _pattern_score(grid: Tensor, brightness: Tensor) -> float:
     centres = (grid[:-1, :-1] + grid[1:, :-1] + grid[:-1, 1:] + grid[1:, 1:]) / 4
     scale = torch.tensor([max(n - 1, 1) for n in (brightness.shape[1], brightness.shape[0])], dtype=torch.float64)
     normalised = (2 * centres / scale - 1).to(torch.float32)
-    smooth = F.avg_pool2d(brightness[None, None], 3, stride=1, padding=1)
-    seen = F.grid_sample(smooth, normalised[None], align_corners=True)[0, 0]
+    seen = F.grid_sample(brightness[None, None], normalised[None], align_corners=True)[0, 0]
     row, column = torch.meshgrid(torch.arange(seen.shape[0]), torch.arange(seen.shape[1]), indexing="ij")
     black = (row + column) % 2 == 0
     inside = (normalised.abs() <= 1).all(-1)

@@ -5,7 +5,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from lsvision.image.checkerboard import gray
+from lsvision.image.brightness import gray_bytes, white_level
+from lsvision.types import TensorImage
 
 _SUBPIXEL_STEPS = 16  # StereoSGBM returns sixteenths of a pixel
 _NUM_MULTIPLE = 16  # and searches ranges that are a multiple of sixteen
@@ -23,15 +24,16 @@ def match_sgbm(
     left_right_check_px: int,
     uniqueness_percent: int,
     speckle_px: int,
+    white: float | None = None,
 ) -> Float[Tensor, "lines width"]:
     """Disparity u_left - u_right of a pair of strips; float32 px, NaN where there is no match.
 
     Args:
-        left, right: ``(lines, width, channels)`` of the same shape; 16-bit values are matched on their upper eight bits
-            of the strip's range.
+        left, right: ``(lines, width, channels)`` of the same shape.
         minimum_px, maximum_px: range searched, both included; it may be negative.
         lambda1, lambda2: penalty of a disparity change by one and by more, per pixel of the block.
         left_right_check_px: largest disagreement of the two views' disparities.
+        white: value that is matched as 255, the brightest of a byte; the pair's ``white_level`` where None.
 
     Raises:
         ValueError: shapes differ or the range is empty.
@@ -39,7 +41,8 @@ def match_sgbm(
     Source: Hirschmüller 2008, Stereo processing by semiglobal matching and mutual information; OpenCV's StereoSGBM.
     """
     check_pair(left, right, minimum_px, maximum_px)
-    pair = grey_bytes(left), grey_bytes(right)
+    white = white or white_level(TensorImage(left), TensorImage(right))
+    pair = gray_bytes(left, white), gray_bytes(right, white)
     penalties = round(lambda1 * block_size**2), round(lambda2 * block_size**2)
     matcher = sgbm_matcher(
         (minimum_px, maximum_px), block_size, penalties, left_right_check_px, uniqueness_percent, speckle_px
@@ -92,14 +95,3 @@ def run_sgbm(matcher: cv2.StereoSGBM, left: Tensor, right: Tensor, maximum_px: i
     in_range = (disparity > minimum_px - 1) & (disparity < maximum_px + 1)
     seen = in_range & (partner >= 0) & (partner <= width - 1)
     return torch.where(seen, disparity, torch.nan)
-
-
-def grey_bytes(image: Tensor) -> Tensor:
-    """Brightness ``(lines, width)`` of ``(lines, width, 1 or 3)`` values, uint8; other types over their own range."""
-    if image.dtype == torch.uint8:
-        if image.shape[-1] == 1:
-            return image[..., 0].contiguous()
-        return torch.from_numpy(cv2.cvtColor(image[..., :3].contiguous().numpy(), cv2.COLOR_RGB2GRAY))
-    values = gray(image)
-    low, high = torch.aminmax(values)
-    return ((values - low) * (255.0 / max(float(high - low), 1.0))).to(torch.uint8)

@@ -14,8 +14,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lsvision.image.agreement import agreeing, fill_from_background
-from lsvision.image.matching import check_pair, grey_bytes, run_sgbm, sgbm_matcher
+from lsvision.image.brightness import gray_bytes, white_level
+from lsvision.image.matching import check_pair, run_sgbm, sgbm_matcher
 from lsvision.image.refinement import refine_disparity
+from lsvision.types import TensorImage
 
 COARSEST = 4  # size of the full image over that of the smallest copy; strips should start at multiples of it
 _AROUND = (-8, 7)  # disparities tried around the coarse one, px of half the size
@@ -43,11 +45,12 @@ def match_coarse_to_fine(
     uniqueness_percent: int,
     speckle_px: int,
     noise: float,
+    white: float | None = None,
 ) -> Float[Tensor, "lines width"]:
     """Disparity u_left - u_right of a pair of strips, good to a tenth of a pixel; float32 px, NaN for no match.
 
     Args:
-        left, right: as in ``match_sgbm``, as are the range, the block, the penalties and the shares.
+        left, right: as in ``match_sgbm``, as are the range, the block, the penalties, the shares and ``white``.
         left_right_check_px: largest disagreement of the two views on the small copy, in full pixels.
         fine_check_px: largest disagreement at half the size, in full pixels.
         speckle_px: smaller patches are removed, in pixels of half the size.
@@ -59,9 +62,10 @@ def match_coarse_to_fine(
     Source: Hirschmüller 2008, as ``match_sgbm``, over a pyramid as in Rothermel et al. 2012, SURE.
     """
     check_pair(left, right, minimum_px, maximum_px)
+    white = white or white_level(TensorImage(left), TensorImage(right))
     penalties = round(lambda1 * block_size**2), round(lambda2 * block_size**2)
     lines, width, _ = left.shape
-    (half_left, left_4), (half_right, right_4) = (_reduced(grey_bytes(image)) for image in (left, right))
+    (half_left, left_4), (half_right, right_4) = (_reduced(gray_bytes(image, white)) for image in (left, right))
     low, high = math.floor(minimum_px / COARSEST), math.ceil(maximum_px / COARSEST)
     check = round(left_right_check_px / COARSEST)
     speckle = _COARSE_SPECKLE * speckle_px

@@ -1,7 +1,8 @@
 """Sub-pixel position of checkerboard corners: a parametric fit of the blurred saddle, all windows at once."""
 
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
 
 import torch
 from jaxtyping import Bool, Float
@@ -13,10 +14,12 @@ from lsvision.image.correlated_noise import correlation_gain
 _POSITION, _ANGLE_1, _ANGLE_2, _BLUR, _LEVELS = slice(0, 2), 2, 3, 4, 5
 _PARAMETERS = 17
 _OFFSET, _CONTRAST = 5, 14
+_TOGETHER = 2**18  # values of a Jacobian that stay in the processor's cache
 # The plain saddle b + g (u, v) + c E1 E2 comes first: it has few minima, the full model then starts inside its own.
 _PLAIN = [0, 1, _ANGLE_1, _ANGLE_2, _BLUR, 5, 6, 7, _CONTRAST]
 _FULL = list(range(_PARAMETERS))
-_SMALLEST_STEP_PX = 1e-5  # shorter steps change nothing that is measured
+# A corner stands still where steps are shorter: the plain saddle's only starts the full one, whose is measured.
+_PLAIN_STEP_PX, _FULL_STEP_PX = 1e-2, 1e-5
 
 
 @dataclass(frozen=True)
@@ -41,6 +44,7 @@ def fit_saddles(
     angles: Float[Tensor, "corners 2"],
     mask: Bool[Tensor, "corners size size"] | None = None,
     *,
+    plain: bool = False,
     iterations: int = 12,
     max_shift_px: float = 3.0,
     max_residual: float = 0.35,
@@ -56,21 +60,41 @@ def fit_saddles(
         windows: grey values, odd size; the corner within about two pixels of the centre. One with a NaN is not valid.
         angles: direction of the normal of each edge, rad from u towards v; good to about 0.3 rad.
         mask: pixels to fit, all where None: those of the four squares around the corner, say.
+        plain: fit one level and gradient to the whole window, good to a few hundredths of a pixel, and leave it there.
         iterations: largest number of steps of either model.
         max_shift_px: a corner further than this from the centre is not valid.
         max_residual: neither is one whose residual rms exceeds this share of its contrast.
     """
+    if mask is None:
+        mask = torch.ones_like(windows, dtype=torch.bool)
+    stages = ((_PLAIN, _PLAIN_STEP_PX),) if plain else ((_PLAIN, _PLAIN_STEP_PX), (_FULL, _FULL_STEP_PX))
+    together = max(1, _TOGETHER // (_PARAMETERS * windows.shape[-1] ** 2))
+    fits = [
+        _fit_together(*part, stages, iterations, max_shift_px, max_residual)
+        for part in zip(windows.split(together), angles.split(together), mask.split(together), strict=True)
+    ]
+    return SaddleFit(*(torch.cat([getattr(fit, item.name) for fit in fits]) for item in fields(SaddleFit)))
+
+
+def _fit_together(
+    windows: Tensor,
+    angles: Tensor,
+    mask: Tensor,
+    stages: Sequence[tuple[list[int], float]],
+    iterations: int,
+    max_shift_px: float,
+    max_residual: float,
+) -> SaddleFit:
     count, size, _ = windows.shape
     half = (size - 1) / 2
     axis = torch.arange(size, dtype=windows.dtype, device=windows.device) - half
     grid = torch.stack(torch.meshgrid(axis, axis, indexing="xy")).flatten(1)
     complete = torch.isfinite(windows).flatten(1).all(-1)
-    weight = torch.ones_like(windows) if mask is None else mask.to(windows.dtype)
-    weight = weight.reshape(count, -1)
+    weight = mask.to(windows.dtype).reshape(count, -1)
     values = torch.where(complete[:, None], windows.reshape(count, -1), 0.0) * weight
     parameters = _initial_parameters(values, grid, weight, angles)
-    for free in (_PLAIN, _FULL):
-        parameters = _descend(parameters, values, grid, weight, free, iterations)
+    for free, smallest_step in stages:
+        parameters = _descend(parameters, values, grid, weight, free, smallest_step, iterations)
     model, jacobian = _saddle(parameters, grid, weight)
     residual = values - model
     variance = residual.square().sum(-1) / (weight.sum(-1) - _PARAMETERS).clamp(min=1)
@@ -96,33 +120,46 @@ def fit_saddles(
 
 
 def _descend(
-    parameters: Tensor, values: Tensor, grid: Tensor, weight: Tensor, free: list[int], iterations: int
+    parameters: Tensor,
+    values: Tensor,
+    grid: Tensor,
+    weight: Tensor,
+    free: list[int],
+    smallest_step: float,
+    iterations: int,
 ) -> Tensor:
     """Levenberg-Marquardt on the ``free`` parameters, each window on its own until its corner stands still."""
     damping = torch.full_like(values[:, 0], 1e-3)
     moving = torch.ones_like(damping, dtype=torch.bool)
-    model, jacobian = _saddle(parameters, grid, weight)
+    model, jacobian = _saddle(parameters, grid, weight, free)
     cost = (values - model).square().sum(-1)
     for _ in range(iterations):
         step = torch.zeros_like(parameters)
-        step[:, free] = _damped_step(jacobian[:, free], values - model, damping)
+        step[:, free] = _damped_step(jacobian, values - model, damping)
         trial = _bounded(parameters + step)
-        trial_model, trial_jacobian = _saddle(trial, grid, weight)
+        trial_model, trial_jacobian = _saddle(trial, grid, weight, free)
         trial_cost = (values - trial_model).square().sum(-1)
         better = moving & (trial_cost < cost)
-        parameters = torch.where(better[:, None], trial, parameters)
-        model = torch.where(better[:, None], trial_model, model)
-        jacobian = torch.where(better[:, None, None], trial_jacobian, jacobian)
-        cost = torch.where(better, trial_cost, cost)
+        parameters, model, jacobian, cost = (
+            _better(better, *pair)
+            for pair in ((trial, parameters), (trial_model, model), (trial_jacobian, jacobian), (trial_cost, cost))
+        )
         damping = torch.where(better, damping / 10, damping * 5).clamp(1e-9, 1e6)
-        moving = moving & (torch.linalg.vector_norm(step[:, _POSITION], dim=-1) > _SMALLEST_STEP_PX)
+        moving = moving & (torch.linalg.vector_norm(step[:, _POSITION], dim=-1) > smallest_step)
         if not bool(moving.any()):
             break
     return parameters
 
 
-def _saddle(parameters: Tensor, grid: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
-    """Weighted model values (corners, pixels) and their Jacobian (corners, 17, pixels)."""
+def _better(better: Tensor, trial: Tensor, current: Tensor) -> Tensor:
+    """The trial of the windows it is better for; no copy where that is all of them."""
+    if bool(better.all()):
+        return trial
+    return torch.where(better.reshape(-1, *[1] * (trial.ndim - 1)), trial, current)
+
+
+def _saddle(parameters: Tensor, grid: Tensor, weight: Tensor, free: list[int] = _FULL) -> tuple[Tensor, Tensor]:
+    """Weighted model values (corners, pixels) and their Jacobian (corners, free, pixels), position to blur first."""
     position, blur = parameters[:, _POSITION], parameters[:, _BLUR, None]
     u, v = grid[0] - position[:, :1], grid[1] - position[:, 1:]
     edges = [_edge(u, v, parameters[:, angle, None], blur) for angle in (_ANGLE_1, _ANGLE_2)]
@@ -139,9 +176,9 @@ def _saddle(parameters: Tensor, grid: Tensor, weight: Tensor) -> tuple[Tensor, T
         slope_2 * along_2,
         -(slope_1 * across_1 + slope_2 * across_2) / blur,
     ]
-    by_levels = (shapes[:, :, None] * plane).flatten(1, 2)
-    jacobian = torch.cat([torch.stack(by_shape, dim=1), by_levels], dim=1)
-    return (levels * shapes).sum(1) * weight, jacobian * weight[:, None]
+    by_levels = [shapes[:, index // 3] * plane[index % 3] for index in (k - _LEVELS for k in free if k >= _LEVELS)]
+    jacobian = torch.stack([*by_shape, *by_levels], dim=1)
+    return (levels * shapes).sum(1) * weight, jacobian.mul_(weight[:, None])
 
 
 def _edge(
@@ -172,20 +209,23 @@ def _initial_parameters(values: Tensor, grid: Tensor, weight: Tensor, angles: Te
 
 def _damped_step(jacobian: Tensor, residual: Tensor, damping: Tensor) -> Tensor:
     """Levenberg-Marquardt step, in parameters scaled so that the unit of the grey values does not matter."""
-    scaled, length = _unit_columns(jacobian)
-    normal = scaled @ scaled.mT + torch.diag_embed(damping[:, None].expand_as(length))
-    return torch.linalg.solve(normal, scaled @ residual[..., None])[..., 0] / length
+    normal, length = _scaled_normal(jacobian)
+    normal.diagonal(dim1=-2, dim2=-1).add_(damping[:, None])
+    pull = (jacobian @ residual[..., None])[..., 0] / length
+    return torch.linalg.solve(normal, pull) / length
 
 
 def _inverse_normal(jacobian: Tensor) -> Tensor:
-    scaled, length = _unit_columns(jacobian)
-    return torch.linalg.pinv(scaled @ scaled.mT, hermitian=True) / (length[:, None] * length[..., None])
+    normal, length = _scaled_normal(jacobian)
+    return torch.linalg.pinv(normal, hermitian=True) / (length[:, None] * length[..., None])
 
 
-def _unit_columns(jacobian: Tensor) -> tuple[Tensor, Tensor]:
-    length = torch.linalg.vector_norm(jacobian, dim=-1)
+def _scaled_normal(jacobian: Tensor) -> tuple[Tensor, Tensor]:
+    """Normal matrix of the Jacobian's rows at unit length, and their lengths."""
+    normal = jacobian @ jacobian.mT
+    length = normal.diagonal(dim1=-2, dim2=-1).sqrt()
     length = torch.where(length > 0, length, 1.0)  # without contrast nothing moves the corner
-    return jacobian / length[..., None], length
+    return normal / (length[:, None] * length[..., None]), length
 
 
 def _bounded(parameters: Tensor) -> Tensor:

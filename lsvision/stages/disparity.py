@@ -3,6 +3,7 @@
 import math
 from collections import OrderedDict
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any, Literal
 
 import torch
@@ -10,11 +11,11 @@ from torch import Tensor
 
 from lsvision.geometry import triangulate
 from lsvision.image.agreement import occluded
-from lsvision.image.checkerboard import gray
-from lsvision.image.matching import grey_bytes, match_sgbm
+from lsvision.image.brightness import gray, gray_bytes, white_level
+from lsvision.image.matching import match_sgbm
 from lsvision.image.pyramid_matching import COARSEST, match_coarse_to_fine
 from lsvision.image.refinement import refine_disparity
-from lsvision.types import LineImage, Rig, Scan
+from lsvision.types import LineImage, Rig, Scan, TensorImage
 
 
 @dataclass(frozen=True)
@@ -77,18 +78,21 @@ def match_strip(left: Tensor, right: Tensor, rig: Rig, config: DisparityConfig) 
     return measure_strip(left, right, rig, config).disparity
 
 
-def measure_strip(left: Tensor, right: Tensor, rig: Rig, config: DisparityConfig) -> StripMatch:
+def measure_strip(
+    left: Tensor, right: Tensor, rig: Rig, config: DisparityConfig, white: float | None = None
+) -> StripMatch:
     """Disparity of a pair of strips ``(lines, width, channels)`` and how well it is known.
 
     Nothing is found where one of the cameras saw no more than its noise. The first line should lie at a multiple of
-    four of the scan's, for the same result whatever the strip.
+    four of the scan's, and ``white`` be the whole scan's (see ``white_level``), for the same result whatever the strip.
     """
-    disparity = _search(left, right, rig, config)
+    white = white or white_level(TensorImage(left), TensorImage(right))
+    disparity = _search(left, right, rig, config, white)
     if config.refine_iterations == 0:
         return StripMatch(disparity, torch.full_like(disparity, torch.nan))
     refined = refine_disparity(
-        _grey(left),
-        _grey(right),
+        _gray(left, white),
+        _gray(right, white),
         disparity,
         window=config.refine_window,
         iterations=config.refine_iterations,
@@ -98,9 +102,9 @@ def measure_strip(left: Tensor, right: Tensor, rig: Rig, config: DisparityConfig
     return StripMatch(refined.disparity, refined.sigma)
 
 
-def _search(left: Tensor, right: Tensor, rig: Rig, config: DisparityConfig) -> Tensor:
+def _search(left: Tensor, right: Tensor, rig: Rig, config: DisparityConfig, white: float) -> Tensor:
     # Every tenth or so pixel tells whether a camera saw anything: in noise alone all would be found to match somewhere.
-    if any(float(grey_bytes(image[::3, ::3]).float().std()) <= config.refine_noise for image in (left, right)):
+    if any(float(_gray(image[::3, ::3], white).float().std()) <= config.refine_noise for image in (left, right)):
         return torch.full(left.shape[:2], torch.nan)
     minimum_px, maximum_px = disparity_range(rig, config)
     options: dict[str, Any] = {
@@ -112,15 +116,16 @@ def _search(left: Tensor, right: Tensor, rig: Rig, config: DisparityConfig) -> T
         "left_right_check_px": config.left_right_check_px,
         "uniqueness_percent": config.uniqueness_percent,
         "speckle_px": config.speckle_px,
+        "white": white,
     }
     if config.matcher == "sgbm":
         return match_sgbm(left, right, **options)
     return match_coarse_to_fine(left, right, **options, fine_check_px=config.fine_check_px, noise=config.refine_noise)
 
 
-def _grey(image: Tensor) -> Tensor:
+def _gray(image: Tensor, white: float) -> Tensor:
     """Brightness on a scale of 0..255, on which the noise is given."""
-    return grey_bytes(image) if image.dtype == torch.uint8 else gray(image) / 257.0
+    return gray_bytes(image) if image.dtype == torch.uint8 else gray(image) * (255.0 / white)
 
 
 def depth_from_disparity(disparity: Tensor, rig: Rig) -> Tensor:
@@ -180,6 +185,11 @@ class MatchedDepth:
         self._strips.move_to_end(index)
         return self._strips[index]
 
+    @cached_property
+    def _white(self) -> float:
+        assert self.scan.right is not None
+        return white_level(self.scan.left, self.scan.right)
+
     def _match(self, index: int) -> Tensor:
         """Depth and its standard deviation, (2, lines, width)."""
         assert self.scan.right is not None
@@ -188,7 +198,11 @@ class MatchedDepth:
         above, below = max(start - self.config.halo_lines, 0), min(stop + self.config.halo_lines, self.scan.lines)
         above -= above % COARSEST  # the blocks of the reduced copies are the same in every strip
         match = measure_strip(
-            self.scan.left.read(above, below), self.scan.right.read(above, below), self.scan.rig, self.config
+            self.scan.left.read(above, below),
+            self.scan.right.read(above, below),
+            self.scan.rig,
+            self.config,
+            self._white,
         )
         inner = slice(start - above, stop - above)
         depth = depth_from_disparity(match.disparity[inner], self.scan.rig)

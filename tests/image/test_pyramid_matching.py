@@ -4,9 +4,10 @@ import pytest
 import torch
 import torch.nn.functional as F  # noqa: N812
 
-from lsvision.image.matching import grey_bytes
+from lsvision.image.brightness import gray_bytes, white_level
 from lsvision.image.pyramid_matching import match_coarse_to_fine
 from lsvision.image.refinement import refine_disparity
+from lsvision.types import TensorImage
 from tests.image.test_matching import OPTIONS
 
 
@@ -30,7 +31,8 @@ def pair(shift: int) -> tuple[torch.Tensor, torch.Tensor]:
 def match(left, right, low=-40, high=40):
     """The search and the refinement that completes it."""
     start = match_coarse_to_fine(left, right, minimum_px=low, maximum_px=high, fine_check_px=4, noise=1.0, **OPTIONS)
-    grey = grey_bytes(left), grey_bytes(right)
+    white = white_level(TensorImage(left), TensorImage(right))
+    grey = gray_bytes(left, white), gray_bytes(right, white)
     return refine_disparity(*grey, start, window=9, iterations=1, noise=1.0, largest_sigma_px=0.5).disparity
 
 

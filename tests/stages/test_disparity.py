@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from lsvision.geometry import triangulate, triangulation_jacobian
-from lsvision.image.checkerboard import gray
+from lsvision.image.brightness import gray
 from lsvision.image.matching import match_sgbm
 from lsvision.simulation import SceneConfig
 from lsvision.stages.disparity import (
