@@ -40,7 +40,7 @@ class StudySettings(RunSettings):
     calibration: CalibrationConfig
     axes: dict[str, list[float | int | str] | None] = field(default_factory=dict)
     runs: int = 500
-    batch: int = 64
+    batch: int = 256
     map_range_deg: float = 15.0
     map_steps: int = 31
 

@@ -21,7 +21,7 @@ from lsvision.experiments.study_points import exact_corners, noise_chol
 from lsvision.experiments.study_runs import noisy_points, run_points
 from lsvision.run import config_folder
 
-RUNS, PEER_RUNS, TURNS, THREADS = 576, 24, 7, 2
+RUNS, PEER_RUNS, TURNS, THREADS = 2048, 96, 7, 2
 
 
 class Peer:
