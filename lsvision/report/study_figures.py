@@ -159,12 +159,13 @@ def consistency(points: polars.DataFrame, band: tuple[float, float]) -> ReportFi
     axes[0].axhspan(0.94, 1.06, color=TRUTH, alpha=0.2, linewidth=0, label="bound ± 6 %")
     axes[1].plot(points["point"], points["nees"], "o", ms=4, color=AFTER)
     axes[1].axhspan(*band, color=COLORS[2], alpha=0.25, linewidth=0, label="95 % band of a right covariance")
-    for panel, title, y in (
-        (axes[0], "Efficiency", "rms error over Cramér-Rao bound [ratio]"),
-        (axes[1], "Consistency", "mean normalised squared error [ratio]"),
+    for panel, name, title, y in (
+        (axes[0], "error_over_bound", "Efficiency", "rms error over Cramér-Rao bound [ratio]"),
+        (axes[1], "nees", "Consistency", "mean normalised squared error [ratio]"),
     ):
-        low, high = panel.get_ylim()
-        if low > 0 and high / low > 5:
+        values = points[name].to_numpy()
+        positive = values[np.isfinite(values) & (values > 0)]
+        if len(positive) and positive.max() > 5 * positive.min():
             panel.set_yscale("log")
         label_axes(panel, title, "point of the study [index]", y)
         panel.xaxis.set_major_locator(MaxNLocator(integer=True))

@@ -95,7 +95,7 @@ def _points_table(study: Study) -> Table:
             str(row["corners"]),
             "  ".join(f"{row[f'rms_n{k}']:.1e}" for k in (1, 2, 3)),
             "  ".join(f"{row[f'sigma_n{k}']:.1e}" for k in (1, 2, 3)),
-            f"{row['error_over_bound']:.3f}",
+            f"{row['error_over_bound']:.3f}" if row["prior_dominated"] < 0.5 else "–",
             f"{row['nees']:.2f}",
             f"{row['rmse_before_mm']:.4f}",
             f"{row['rmse_after_mm']:.4f}",
@@ -107,6 +107,7 @@ def _points_table(study: Study) -> Table:
     ]
     left_out = len(study.points) - len(rows)
     note = f"{left_out} more points are in points.parquet." if left_out else "points.parquet has every column."
+    note += " Where the prior dominates, the error is that of the prior, whatever the bound."
     return Table("Points of the study", header, rows, note)
 
 
