@@ -3,6 +3,7 @@
 import json
 import shutil
 import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -76,6 +77,15 @@ def folder(tmp_path, determined, corners):
     return tmp_path
 
 
+@pytest.fixture(scope="module")
+def swept(tmp_path_factory) -> Path:
+    """A sweep of two small studies: its own report and one of each job."""
+    folder = tmp_path_factory.mktemp("swept")
+    command = [sys.executable, "-m", "lsvision.run", "--multirun", "+experiment=study_tilts", "runs=4,5", "map_steps=3"]
+    subprocess.run([*command, f"hydra.sweep.dir={folder}"], capture_output=True, timeout=300, check=True)
+    return folder
+
+
 def open_page(chromium: str, page: Path, width: int, *flags: str) -> tuple[dict, str, dict]:
     """What the probe found, the browser's log and its record of network traffic."""
     probed = page.with_name("probed.html")
@@ -109,18 +119,30 @@ def asked_for(record: dict) -> list[str]:
     ("width", "flags"), [(1280, ()), (1280, ("--blink-settings=preferredColorScheme=0",)), (500, ())]
 )
 def test_a_page_opens_from_disk(name, width, flags, folder, chromium):
-    found, log, record = open_page(chromium, folder / name / "report.html", width, *flags)
+    found = check_page(chromium, folder / name / "report.html", width, *flags)
+    assert found["images"] > 10
+    assert found["turned"] == 3
+    light = "rgb(246, 247, 248)"
+    assert (found["background"] == light) == (not flags)
+
+
+@pytest.mark.parametrize("name", [".", "1"])
+@pytest.mark.parametrize("width", [1280, 500])
+def test_a_study_and_a_sweep_open_from_disk(name, width, swept, chromium):
+    assert check_page(chromium, swept / name / "report.html", width)["images"] > 0
+
+
+def check_page(chromium: str, page: Path, width: int, *flags: str) -> dict:
+    """Open a page, check what holds for every report, and return what the probe found."""
+    found, log, record = open_page(chromium, page, width, *flags)
     assert "CONSOLE" not in log
     assert asked_for(record) == []
     assert [name for name in found["resources"] if not name.startswith("data:")] == []
     assert found["broken"] == 0
-    assert found["images"] > 10
-    assert found["turned"] == 3
     assert found["zoomed"]
     assert found["closed"]
     assert found["width"] <= found["inner"]
-    light = "rgb(246, 247, 248)"
-    assert (found["background"] == light) == (not flags)
+    return found
 
 
 def test_the_checks_see_a_request_and_an_error(tmp_path, chromium):
