@@ -17,9 +17,13 @@ from lsvision.errors import ConfigError, LsvisionError
 _LOOK_SECONDS = 1.0
 
 # Tasks wait at the scheduler, not at a worker: the death of one says something of its own task alone. A local worker
-# loads what tasks need before it takes one, so that no task answers for that time.
+# loads what tasks need before it takes one, so that no task answers for that time. It keeps freed memory for the next
+# strip: Dask's own setting gives it back after every operation, which trebles the time.
 _SETTINGS = {
     "distributed.worker.preload": ["lsvision.archive.tasks"],
+    "distributed.nanny.pre-spawn-environ.MALLOC_TRIM_THRESHOLD_": 2**30,
+    "distributed.nanny.pre-spawn-environ.MALLOC_ARENA_MAX": 1,
+    "distributed.worker.profile.enabled": False,
     "distributed.scheduler.allowed-failures": MOST_DEATHS - 1,
     "distributed.scheduler.worker-saturation": 1.0,
     "distributed.comm.timeouts.connect": "10s",

@@ -102,8 +102,8 @@ class LocalEngine:
 
     @property
     def capacity(self) -> int:
-        """One task a worker."""
-        return self._workers
+        """A task a worker and as many waiting, so that no worker waits for this process."""
+        return 2 * self._workers
 
     def submit(self, task: Task) -> None:
         """Take a task for the next worker that is free."""

@@ -9,7 +9,7 @@ import logging
 import shutil
 import time
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any, Literal
 
@@ -20,6 +20,7 @@ import zarr
 from zarr.codecs import ZstdCodec
 
 from lsvision.errors import FileFormatError, LsvisionError
+from lsvision.image.tiling import keep_freed_memory
 from lsvision.io import (
     ProductRows,
     check_product,
@@ -178,6 +179,7 @@ def run_task(task: Task) -> TaskResult:
     """Do a piece of work on one thread; whatever is wrong with its data is its result, never an exception."""
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
+    _keep_freed_memory()
     begin = time.perf_counter()
     try:
         result = task.work.run()
@@ -223,6 +225,9 @@ def damage_of(path: str, measured: int) -> str:
         return str(error)
     found = round(check.valid_share * check.rows * check.columns)
     return "" if found == measured else f"{path}: expected {measured} measured cells, found {found}"
+
+
+_keep_freed_memory = cache(keep_freed_memory)  # once a process
 
 
 # Neighbouring strips of a scan share the parts of the files that were decoded last.

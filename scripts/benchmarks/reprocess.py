@@ -29,16 +29,17 @@ from lsvision.archive import (
 )
 from lsvision.archive.dask_engine import DaskEngine
 from lsvision.archive.tasks import Task, TaskResult
+from lsvision.image.tiling import keep_freed_memory
 from lsvision.io import ProductLayout, ProductWriter, read_calibration, read_scan, write_calibration, write_scan
 from lsvision.stages.correction import CorrectionConfig, correct_scan, plan_product
 from lsvision.stages.disparity import DisparityConfig, depth_of
 from lsvision.types import Calibration, Motion, Observability, Rig, Travel
 
-RIG = Rig(893, 80.0, 113.84, 354.0, 129.8125, 761.9375)
-SCANS, LINES = 2, 2048
+RIG = Rig(1786, 40.0, 113.84, 354.0, 260.125, 1524.375)
+SCANS, LINES = 2, 4096
 TURNS = 3
 WORKER_MEMORY_MB = 2048
-PROCESSING = Processing(DisparityConfig(strip_lines=256), CorrectionConfig(strip_rows=256), False, WORKER_MEMORY_MB)
+PROCESSING = Processing(DisparityConfig(), CorrectionConfig(), False, WORKER_MEMORY_MB)
 
 
 @dataclass(frozen=True)
@@ -61,7 +62,7 @@ def make_archive(root: Path) -> Path:
         texture = torch.nn.functional.avg_pool2d(noise, 3, 1, 1)[:, 0].movedim(0, -1)
         left = ((texture - 0.5) * 400 + 128).clamp(0, 255).to(torch.uint8)
         write_scan(
-            root / f"scan{number}", rig=RIG, travel=Travel(0.56), left=[left], right=[left.roll(-4, 1)], lines=LINES
+            root / f"scan{number}", rig=RIG, travel=Travel(0.28), left=[left], right=[left.roll(-4, 1)], lines=LINES
         )
     motion = Motion(torch.tensor([0.02, 1.02, -0.01]).double(), 1e-8 * torch.eye(3).double())
     path = root / "calibration.json"
@@ -120,6 +121,7 @@ def started(make: Callable[[], Engine], workers: int) -> Iterator[Engine]:
 def run() -> dict[str, object]:
     """Lines a second of the bare stages and of every engine, medians of turns taken one after the other."""
     torch.set_num_threads(1)
+    keep_freed_memory()  # as the command that corrects one scan does, and every worker
     engines: dict[str, tuple[Callable[[], Engine], int]] = {
         "local_1": (lambda: LocalEngine(1), 1),
         "local_2": (lambda: LocalEngine(2), 2),
