@@ -15,6 +15,7 @@ from lsvision.archive.plan import (
     predicted_seconds,
     product_path,
 )
+from lsvision.archive.remote import local_archive
 from lsvision.archive.run import run_jobs
 
 __all__ = [
@@ -34,6 +35,7 @@ __all__ = [
     "calibration_for",
     "find_scans",
     "ledger_lines",
+    "local_archive",
     "plan_run",
     "predicted_bytes",
     "predicted_seconds",

@@ -10,7 +10,7 @@ from pathlib import Path
 from lsvision.errors import ConfigError
 
 SCAN_FILE = "scan.yaml"
-_PATTERN = "*?["
+PATTERN_SIGNS = "*?["
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ def find_scans(archive: str, skip: Path | None = None) -> list[Found]:
     elif path.is_file():
         listed = [path.parent / line.strip() for line in path.read_text(encoding="utf-8").splitlines() if line.strip()]
         places, root = ((place, None) for place in listed), _common_root(listed)
-    elif any(sign in archive for sign in _PATTERN):
+    elif any(sign in archive for sign in PATTERN_SIGNS):
         matched = [Path(match) for match in glob.glob(archive, recursive=True) if Path(match, SCAN_FILE).is_file()]
         places, root = ((place, None) for place in matched), _common_root(matched)
     else:

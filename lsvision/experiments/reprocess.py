@@ -18,6 +18,7 @@ from lsvision.archive import (
     ScanRow,
     find_scans,
     ledger_lines,
+    local_archive,
     plan_run,
     predicted_bytes,
     predicted_seconds,
@@ -28,7 +29,7 @@ from lsvision.archive import (
     verify_job,
     worker_count,
 )
-from lsvision.archive.jobs import Job
+from lsvision.archive.jobs import WORK_FOLDER, Job
 from lsvision.archive.tasks import Task, TaskResult
 from lsvision.errors import ConfigError, ScansFailedError
 from lsvision.experiments.progress import progress_bars
@@ -105,7 +106,7 @@ def run_status(settings: StatusSettings, folder: Path) -> None:
 
 def _plan(settings: ReprocessSettings, output: Path, known: dict[str, ScanRow]) -> Plan:
     calibrations = read_calibrations(settings.calibration)
-    found = find_scans(settings.archive, skip=output)
+    found = find_scans(local_archive(settings.archive, output / WORK_FOLDER / "copies"), skip=output)
     if not found:
         raise ConfigError(f"archive: no scans in {settings.archive}")
     return plan_run(found, calibrations, _processing(settings), known, output)

@@ -2,10 +2,12 @@
 
 from pathlib import Path
 
+import fsspec
 import pytest
 
-from lsvision.archive import find_scans
+from lsvision.archive import find_scans, local_archive
 from lsvision.errors import ConfigError
+from lsvision.io import read_scan
 
 
 def touch(root: Path, *names: str) -> None:
@@ -61,3 +63,53 @@ def test_links_in_circles_are_told_and_not_followed(tmp_path):
 def test_what_is_not_there(tmp_path):
     with pytest.raises(ConfigError, match="archive: no such folder"):
         find_scans(str(tmp_path / "nowhere"))
+
+
+@pytest.fixture
+def remote(archive):
+    """The archive in a file system that is not this machine's, its scans sharing one rig."""
+    files = fsspec.filesystem("memory")
+    files.put(str(archive), "/bucket", recursive=True)
+    for name in ("a", "b"):
+        scan = f"/bucket/{name}/scan.yaml"
+        files.pipe_file(scan, files.cat_file(scan).replace(b"rig: rig.yaml", b"rig: ../rig.yaml"))
+    files.mv("/bucket/a/rig.yaml", "/bucket/rig.yaml")
+    files.rm("/bucket/b/rig.yaml")
+    yield files
+    files.rm("/bucket", recursive=True)
+
+
+@pytest.mark.parametrize(
+    ("url", "keys"),
+    [
+        ("memory://bucket", ["2024/c", "2024/d", "a", "b"]),
+        ("memory://bucket/?", ["a", "b"]),
+        ("memory://bucket/2024/*", ["c", "d"]),
+    ],
+)
+def test_scans_behind_a_url_are_copied_with_their_rigs(remote, tmp_path, url, keys):
+    found = find_scans(local_archive(url, tmp_path))
+    assert [item.key for item in found] == keys
+    for item in found:
+        assert read_scan(item.path).lines > 0
+
+
+def test_unchanged_files_of_a_url_are_not_copied_again(remote, tmp_path):
+    local_archive("memory://bucket", tmp_path)
+    times = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*") if path.is_file()}
+    local_archive("memory://bucket", tmp_path)
+    assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*") if path.is_file()} == times
+    remote.pipe_file("/bucket/a/left.tif", b"other")
+    remote.rm("/bucket/b", recursive=True)
+    local_archive("memory://bucket", tmp_path)
+    assert (tmp_path / "a" / "left.tif").read_bytes() == b"other"
+    assert [item.key for item in find_scans(str(tmp_path))] == ["2024/c", "2024/d", "a"]
+
+
+def test_urls_of_this_machine_and_of_nowhere(archive, tmp_path):
+    assert [item.key for item in find_scans(local_archive(f"file://{archive}/?", tmp_path))] == ["a", "b"]
+    assert not list(tmp_path.iterdir())
+    with pytest.raises(ConfigError, match="archive: nothing://here cannot be read"):
+        local_archive("nothing://here", tmp_path)
+    with pytest.raises(ConfigError, match="archive: no scans at /empty"):
+        local_archive("memory://empty/*", tmp_path)
