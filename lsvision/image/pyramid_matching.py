@@ -19,6 +19,7 @@ from lsvision.image.matching import check_pair, run_sgbm, sgbm_matcher
 from lsvision.image.refinement import refine_disparity
 from lsvision.types import TensorImage
 
+BLOCK = 2  # pixels along the side of the blocks that get a disparity
 COARSEST = 4  # size of the full image over that of the smallest copy; strips should start at multiples of it
 _AROUND = (-8, 7)  # disparities tried around the coarse one, px of half the size
 # Surfaces that differ by less over a neighbourhood of the small copy, px of it, are within reach of one search.
@@ -27,7 +28,6 @@ _NEIGHBOURHOOD = 5
 _ROOM_PX = 64
 _SMOOTH_PX = 2.0  # a larger step between neighbours is an edge, over which nothing is interpolated
 _COARSE_SPECKLE = 2  # times the pixels of a speckle: what is removed here is found again at half the size
-_BAND = 64  # lines of the full size worked on at once
 _COST_BLOCK, _COST_LIMIT, _NO_MATCH = 5, 60, 255.0
 
 
@@ -46,8 +46,10 @@ def match_coarse_to_fine(
     speckle_px: int,
     noise: float,
     white: float | None = None,
-) -> Float[Tensor, "lines width"]:
-    """Disparity u_left - u_right of a pair of strips, good to a tenth of a pixel; float32 px, NaN for no match.
+) -> Float[Tensor, "rows columns"]:
+    """Disparity u_left - u_right of each 2 x 2 pixels of a pair of strips, the last ones perhaps incomplete.
+
+    In pixels of the full size, float32, and good to a fifth of one; NaN for no match. ``refine_disparity`` takes it.
 
     Args:
         left, right: as in ``match_sgbm``, as are the range, the block, the penalties, the shares and ``white``.
@@ -72,7 +74,7 @@ def match_coarse_to_fine(
     matcher = sgbm_matcher((low, high), block_size, penalties, check, uniqueness_percent, speckle)
     coarse = fill_from_background(run_sgbm(matcher, left_4, right_4, high))
     if coarse is None:
-        return left.new_full((lines, width), torch.nan, dtype=torch.float32)
+        return left.new_full((-(-lines // BLOCK), -(-width // BLOCK)), torch.nan, dtype=torch.float32)
     check = round(fine_check_px / 2)
     matcher = sgbm_matcher(_AROUND, block_size, penalties, check, uniqueness_percent, 0)
     near, far = _surfaces(coarse)
@@ -85,23 +87,17 @@ def match_coarse_to_fine(
         cost[:, columns] = torch.minimum(behind_cost, cost[:, columns])
     disparity = agreeing(_without_speckles(disparity, speckle_px), cost, fine_check_px / 2)
     disparity = refine_disparity(half_left, half_right, disparity, window=9, iterations=1, noise=noise).disparity
-    return _full_size(disparity, lines, width, minimum_px, maximum_px)
+    disparity = disparity[: -(-lines // BLOCK), : -(-width // BLOCK)].mul(BLOCK)
+    return _within(disparity, minimum_px, maximum_px, width)
 
 
-def _full_size(half: Tensor, lines: int, width: int, minimum_px: int, maximum_px: int) -> Tensor:
-    """Disparity at full size, without what lies beyond the range or has its partner beyond the image."""
-    full = half.new_empty(lines, width)
-    column = torch.arange(width)
-    for start in range(0, lines, _BAND):
-        # A line more on either side, which the interpolation looks at.
-        above, below = max(start // 2 - 1, 0), min((start + _BAND) // 2 + 1, half.shape[0])
-        enlarged = _enlarged(2 * half[above:below], (2 * (below - above), 2 * half.shape[1]))
-        band = full[start : start + _BAND]
-        band.copy_(enlarged[start - 2 * above :, :width][: len(band)])
-        partner = column - band
-        outside = (partner < 0) | (partner > width - 1) | (band <= minimum_px - 1) | (band >= maximum_px + 1)
-        band.masked_fill_(outside, torch.nan)
-    return full
+def _within(disparity: Tensor, minimum_px: int, maximum_px: int, width: int) -> Tensor:
+    """Disparity of blocks without what lies beyond the range or has its partner beyond the image, ``width`` px wide."""
+    partner = BLOCK * torch.arange(disparity.shape[1]) + (BLOCK - 1) / 2 - disparity
+    # Both columns of a block; the lowest partner is 0, the highest width - 1.
+    seen = (partner - (width - 1) / 2).abs_() <= (width - BLOCK) / 2
+    in_range = (disparity > minimum_px - 1) & (disparity < maximum_px + 1)
+    return torch.where(seen & in_range, disparity, torch.nan)
 
 
 def _reduced(image: Tensor) -> tuple[Tensor, Tensor]:
