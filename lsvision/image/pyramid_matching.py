@@ -7,9 +7,11 @@ find, fractions of a pixel, is the work of ``refine_disparity``.
 """
 
 import math
+from typing import Any
 
 import cv2
 import torch
+import torch.nn.functional as F  # noqa: N812
 from jaxtyping import Float
 from torch import Tensor
 
@@ -28,6 +30,11 @@ _NEIGHBOURHOOD = 5
 _ROOM_PX = 64
 _SMOOTH_PX = 2.0  # a larger step between neighbours is an edge, over which nothing is interpolated
 _COARSE_SPECKLE = 2  # times the pixels of a speckle: what is removed here is found again at half the size
+# The small copy is in doubt where its refinement leaves residuals over noise that a shift by less, px of half the size,
+# does not explain, in more than so many of 255 parts of a neighbourhood.
+_DOUBTFUL_PX = 0.45
+_DOUBT_BLOCK, _DOUBT_LEVEL = 9, 48
+_WINDOW, _COARSE_WINDOW = 9, 7  # of the refinement
 _COST_BLOCK, _COST_LIMIT, _NO_MATCH = 5, 60, 255.0
 
 
@@ -72,23 +79,55 @@ def match_coarse_to_fine(
     check = round(left_right_check_px / COARSEST)
     speckle = _COARSE_SPECKLE * speckle_px
     matcher = sgbm_matcher((low, high), block_size, penalties, check, uniqueness_percent, speckle)
-    coarse = fill_from_background(run_sgbm(matcher, left_4, right_4, high))
-    if coarse is None:
+    coarse = run_sgbm(matcher, left_4, right_4, high)
+    coarse = refine_disparity(left_4, right_4, coarse, window=_COARSE_WINDOW, iterations=1, noise=noise).disparity
+    filled = fill_from_background(coarse)
+    if filled is None:
         return left.new_full((-(-lines // BLOCK), -(-width // BLOCK)), torch.nan, dtype=torch.float32)
-    check = round(fine_check_px / 2)
-    matcher = sgbm_matcher(_AROUND, block_size, penalties, check, uniqueness_percent, 0)
-    near, far = _surfaces(coarse)
-    disparity, cost = _match_around(matcher, half_left, half_right, near, slice(0, near.shape[1]))
-    columns = _where_two(near, far)
-    if columns is not None:
-        behind, behind_cost = _match_around(matcher, half_left, half_right, far, columns)
-        better = behind_cost < cost[:, columns]
-        disparity[:, columns] = torch.where(better, behind, disparity[:, columns])
-        cost[:, columns] = torch.minimum(behind_cost, cost[:, columns])
-    disparity = agreeing(_without_speckles(disparity, speckle_px), cost, fine_check_px / 2)
-    disparity = refine_disparity(half_left, half_right, disparity, window=9, iterations=1, noise=noise).disparity
+    near, far = _surfaces(filled)
+    # Where the light of two surfaces mixes, or the ground is steep, a base that follows the ground asks for lighter
+    # penalties; ``agreeing`` checks the other view.
+    steps = _AROUND[1] - _AROUND[0] + 1
+    matcher = sgbm_matcher(_AROUND, block_size, (penalties[0] // 2, penalties[1]), steps, 0, 0)
+    checks = speckle_px, fine_check_px / 2
+    disparity = _at_half_size(matcher, half_left, half_right, (near, far), coarse.isnan(), checks, noise)
     disparity = disparity[: -(-lines // BLOCK), : -(-width // BLOCK)].mul(BLOCK)
     return _within(disparity, minimum_px, maximum_px, width)
+
+
+def _at_half_size(
+    matcher: cv2.StereoSGBM,
+    left: Tensor,
+    right: Tensor,
+    surfaces: tuple[Tensor, Tensor],
+    missing: Tensor,
+    checks: tuple[int, float],
+    noise: float,
+) -> Tensor:
+    """Refined disparity at half the size, searched for only where the small copy is in doubt.
+
+    The doubt follows from the surroundings of a pixel alone, so that the result does not depend on the strip.
+    """
+    (near, far), (speckle_px, limit_px) = surfaces, checks
+    options: dict[str, Any] = {"window": _WINDOW, "iterations": 1, "noise": noise}
+    disparity = refine_disparity(left, right, near, **options, largest_sigma_px=_DOUBTFUL_PX / _WINDOW).disparity
+    wrong, two = disparity.isnan(), near > far
+    disparity = torch.where(wrong, near, disparity)
+    cost = _misfit(left, right, disparity, slice(0, near.shape[1]))
+    doubtful = _around(wrong | two | _repeated(missing, COARSEST // BLOCK))
+    for base, where in ((near, doubtful), (far, two)):
+        for columns in _stretches(where.any(0)):
+            found = _match_around(matcher, left, right, base, columns)
+            misfit = _misfit(left, right, found, columns)
+            better = (misfit < cost[:, columns]).logical_and_(where[:, columns])
+            disparity[:, columns] = torch.where(better, found, disparity[:, columns])
+            cost[:, columns] = torch.where(better, misfit, cost[:, columns])
+    disparity = agreeing(_without_speckles(disparity, speckle_px), cost, limit_px)
+    for columns in _stretches(doubtful.any(0)):
+        part, start = disparity[:, columns], columns.start
+        refined = refine_disparity(left[:, columns], right, part, first_column=start, **options).disparity
+        disparity[:, columns] = torch.where(doubtful[:, columns], refined, part)
+    return disparity
 
 
 def _within(disparity: Tensor, minimum_px: int, maximum_px: int, width: int) -> Tensor:
@@ -120,26 +159,40 @@ def _surfaces(coarse: Tensor) -> tuple[Tensor, Tensor]:
     return near, far
 
 
-def _where_two(near: Tensor, far: Tensor) -> slice | None:
-    """The columns within which two surfaces are near each other, with room for a search; None where there are none."""
-    apart = (near > far).any(0).nonzero()
-    if not len(apart):
-        return None
-    return slice(max(int(apart[0]) - _ROOM_PX, 0), min(int(apart[-1]) + _ROOM_PX + 1, near.shape[1]))
+def _around(where: Tensor) -> Tensor:
+    """Pixels where a good part of a small neighbourhood is marked, and those near such pixels."""
+    marked = where.to(torch.uint8).mul_(255).numpy()
+    dense = cv2.threshold(cv2.blur(marked, (_DOUBT_BLOCK, _DOUBT_BLOCK)), _DOUBT_LEVEL, 255, cv2.THRESH_BINARY)[1]
+    kernel = cv2.getStructuringElement(cv2.MORPH_RECT, (2 * _DOUBT_BLOCK + 1, 2 * _DOUBT_BLOCK + 1))
+    return torch.from_numpy(cv2.dilate(dense, kernel)) > 0
 
 
-def _match_around(
-    matcher: cv2.StereoSGBM, left: Tensor, right: Tensor, base: Tensor, columns: slice
-) -> tuple[Tensor, Tensor]:
-    """Disparity in some columns by a search around a base, and how badly it fits: mean absolute difference by block."""
-    left, base = left[:, columns].contiguous(), base[:, columns]
+def _repeated(mask: Tensor, times: int) -> Tensor:
+    return mask.repeat_interleave(times, 0).repeat_interleave(times, 1)
+
+
+def _stretches(columns: Tensor) -> list[slice]:
+    """Stretches of marked columns with room for a search on either side."""
+    wide = F.max_pool1d(columns.float()[None], 2 * _ROOM_PX + 1, 1, _ROOM_PX)[0]
+    bounds = F.pad(wide, (1, 1)).diff().nonzero()[:, 0].view(-1, 2)
+    return [slice(start, stop) for start, stop in bounds.tolist()]
+
+
+def _match_around(matcher: cv2.StereoSGBM, left: Tensor, right: Tensor, base: Tensor, columns: slice) -> Tensor:
+    """Disparity in some columns by a search around a base."""
+    base = base[:, columns]
     column = torch.arange(columns.start, columns.stop, dtype=torch.float32)
-    disparity = base + run_sgbm(matcher, left, _sampled(right, column - base), _AROUND[1])
+    disparity = base + run_sgbm(matcher, left[:, columns], _sampled(right, column - base), _AROUND[1])
     partner = column - disparity
-    disparity = torch.where((partner > -0.5) & (partner < right.shape[1] - 0.5), disparity, torch.nan)
-    difference = cv2.absdiff(_sampled(right, torch.nan_to_num(partner)).numpy(), left.numpy())
+    return torch.where((partner > -0.5) & (partner < right.shape[1] - 0.5), disparity, torch.nan)
+
+
+def _misfit(left: Tensor, right: Tensor, disparity: Tensor, columns: slice) -> Tensor:
+    """How badly the disparity of some columns fits: mean absolute difference over a block."""
+    partner = torch.arange(columns.start, columns.stop, dtype=torch.float32) - disparity
+    difference = cv2.absdiff(_sampled(right, torch.nan_to_num(partner)).numpy(), left[:, columns].numpy())
     cost = torch.from_numpy(cv2.blur(difference.clip(max=_COST_LIMIT), (_COST_BLOCK, _COST_BLOCK))).to(torch.float32)
-    return disparity, torch.where(disparity.isnan(), _NO_MATCH, cost)
+    return torch.where(disparity.isnan(), _NO_MATCH, cost)
 
 
 def _sampled(image: Tensor, column: Tensor) -> Tensor:

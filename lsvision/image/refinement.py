@@ -32,9 +32,10 @@ class RefinedDisparity:
 
 def refine_disparity(
     left: Shaped[Tensor, "lines width"],
-    right: Shaped[Tensor, "lines width"],
+    right: Shaped[Tensor, "lines right_width"],
     disparity: Float[Tensor, "rows columns"],
     *,
+    first_column: int = 0,
     window: int,
     iterations: int,
     noise: float,
@@ -54,7 +55,8 @@ def refine_disparity(
 
     Args:
         left, right: grey values of the pair.
-        disparity: px of the images, one value a pixel or a block of 2 x 2 pixels.
+        disparity: px of the images, one value a pixel of the left one or a block of 2 x 2.
+        first_column: of the right image is where the left one begins, which may be a part of it.
         window: side of the square window, px, odd; rounded up to an odd number of blocks.
         iterations: at least one.
         noise: standard deviation of the grey values' noise, on their scale.
@@ -63,7 +65,7 @@ def refine_disparity(
             texture says little, but a wrong match says the wrong thing.
 
     Returns:
-        Values for each pixel of the images.
+        Values for each pixel of the left image.
 
     Raises:
         ValueError: the disparity has neither one value a pixel nor one a block.
@@ -78,10 +80,12 @@ def refine_disparity(
 
     def refine_rows(rows: tuple[int, int, int, int]) -> None:
         above, start, stop, below = rows
-        pair = _whole_blocks(left, above, below, block), _whole_blocks(right, above, below, block)
+        left_rows, right_rows = (_whole_blocks(image, above, below, block) for image in (left, right))
         for before, first, last, after in _tiles(disparity.shape[1], _TILE_COLUMNS // block, reach):
             outer = disparity[above:below, before:after]
-            current, deviation, residual = _refine_tile(pair, outer, block * before, window, iterations, noise)
+            pair = left_rows[:, block * before : block * after], right_rows
+            column = first_column + block * before
+            current, deviation, residual = _refine_tile(pair, outer, column, window, iterations, noise)
             current = outer + _small(current.sub_(outer), largest_change_px)
             deviation.mul_(scatter)
             current.masked_fill_((deviation > largest).logical_and_(residual > _NOISE_RESIDUAL * noise**2), torch.nan)
@@ -167,10 +171,10 @@ def _refine_tile(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Refined disparity, the standard deviation of one least-squares step, and the residual's variance, by block.
 
-    The disparity begins at ``column`` of the images, which are whole: a partner may lie anywhere.
+    The left image begins at ``column`` of the right one, which is whole: a partner may lie anywhere.
     """
-    block = pair[0].shape[0] // disparity.shape[0]
-    left, right = pair[0][:, column : column + block * disparity.shape[1]], pair[1]
+    left, right = pair
+    block = left.shape[0] // disparity.shape[0]
     windows = _Windows.over((disparity == disparity).to(left.dtype), window)  # unknown where it is NaN
     current = torch.nan_to_num(disparity)
     # The left image's slope: its noise is independent of the right one's, which interpolation smooths between pixels,
