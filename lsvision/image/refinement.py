@@ -19,7 +19,7 @@ _ROUNDING = 1.0 / 6.0  # variance of the difference of two whole grey values
 # and that of another which interpolation has smoothed to 0.6 of it on average.
 _SLOPE_NOISE = 0.5 / 1.6
 _NOISE_RESIDUAL = 4.0  # times the noise's variance in one image; two have twice of it
-_SMOOTH_PX = 4.0  # a larger step between neighbouring blocks is an edge, over which nothing is interpolated
+_SMOOTH_PX = 4.0  # an interpolated value that differs by more from its block's own one mixes two surfaces
 
 
 @dataclass(frozen=True)
