@@ -1,9 +1,10 @@
 """Dense stereo matching from coarse to fine: the whole range on a small copy, a few disparities on a larger one.
 
-A quarter of the size holds a sixteenth of the pixels and a quarter of the disparities. What it finds is wrong by a
-pixel of its own here and there, and by a few beside an edge, where blocks see two surfaces. So around each pixel the
-nearest and the farthest surface are both tried at half the size, and the one that fits better stays. What is left to
-find, fractions of a pixel, is the work of ``refine_disparity``.
+A quarter of the size holds a sixteenth of the pixels and a quarter of the disparities. On smooth ground what it finds,
+refined, is good to half a pixel of its own, within reach of the refinement at half the size. Where that leaves more
+than noise, where the small copy found nothing, and beside an edge, where blocks see two surfaces, the nearest and the
+farthest surface around are both searched for at half the size, and what fits best stays. What is left to find,
+fractions of a pixel, is the work of ``refine_disparity``.
 """
 
 import math
@@ -59,8 +60,8 @@ def match_coarse_to_fine(
     In pixels of the full size, float32, and good to a fifth of one; NaN for no match. ``refine_disparity`` takes it.
 
     Args:
-        left, right: as in ``match_sgbm``, as are the range, the block, the penalties, the shares and ``white``.
-        left_right_check_px: largest disagreement of the two views on the small copy, in full pixels.
+        left, right: as in ``match_sgbm``, as are the range, the block, the penalties and ``white``.
+        left_right_check_px, uniqueness_percent: on the small copy, the former in full pixels.
         fine_check_px: largest disagreement at half the size, in full pixels.
         speckle_px: smaller patches are removed, in pixels of half the size.
         noise: standard deviation of the grey values, of 255.
@@ -85,8 +86,8 @@ def match_coarse_to_fine(
     if filled is None:
         return left.new_full((-(-lines // BLOCK), -(-width // BLOCK)), torch.nan, dtype=torch.float32)
     near, far = _surfaces(filled)
-    # Where the light of two surfaces mixes, or the ground is steep, a base that follows the ground asks for lighter
-    # penalties; ``agreeing`` checks the other view.
+    # What is searched for is steep or small: changes cost less than at a quarter of the size. No check is asked of the
+    # search itself, since ``agreeing`` compares what all of them found.
     steps = _AROUND[1] - _AROUND[0] + 1
     matcher = sgbm_matcher(_AROUND, block_size, (penalties[0] // 2, penalties[1]), steps, 0, 0)
     checks = speckle_px, fine_check_px / 2
