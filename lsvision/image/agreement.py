@@ -1,11 +1,13 @@
 """What the right camera says about the left one's disparities: agreement, occlusion, and what may lie in the gaps."""
 
+import numpy as np
 import torch
+import torch.nn.functional as F  # noqa: N812
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-_CODE = 4096.0  # a cost and a whole disparity share one float32 exactly
-_NOBODY = 1e9
+_CODE = 4096  # a cost and a whole disparity share one integer
+_NOBODY = 2**30
 
 
 def agreeing(
@@ -22,10 +24,10 @@ def agreeing(
     """
     whole = torch.nan_to_num(disparity).round()
     partner, inside = _partner(disparity, whole)
-    claim = torch.where(inside, cost * _CODE + whole + _CODE / 2, _NOBODY)
+    claim = torch.where(inside, torch.add(whole, cost, alpha=_CODE).add_(_CODE / 2), _NOBODY).to(torch.int32)
     best = torch.full_like(claim, _NOBODY).scatter_reduce_(1, partner, claim, "amin").gather(1, partner)
-    winner = best.remainder(_CODE) - _CODE / 2
-    return torch.where(inside & ((disparity - winner).abs() <= limit_px), disparity, torch.nan)
+    winner = best.bitwise_and_(_CODE - 1).sub_(_CODE // 2)
+    return torch.where(((disparity - winner).abs_() <= limit_px).logical_and_(inside), disparity, torch.nan)
 
 
 def occluded(disparity: Float[Tensor, "lines width"], limit_px: float = 1.0) -> Bool[Tensor, "lines width"]:
@@ -52,17 +54,20 @@ def fill_from_background(disparity: Float[Tensor, "lines width"]) -> Float[Tenso
 
     None where nothing is known.
     """
-    known = disparity == disparity  # not NaN, in one pass
-    if not bool(known.any()):
+    known = (disparity == disparity).numpy()  # not NaN
+    if known.all():
+        return disparity
+    if not known.any():
         return None
     width = disparity.shape[1]
-    column = torch.arange(width)
-    before = torch.where(known, column, -1).cummax(1).values
-    after = torch.where(known, column, width).flip(1).cummin(1).values.flip(1)
-    left = torch.where(before >= 0, disparity.gather(1, before.clamp(min=0)), torch.inf)
-    right = torch.where(after < width, disparity.gather(1, after.clamp(max=width - 1)), torch.inf)
+    column = np.arange(width, dtype=np.int32)
+    before = np.maximum.accumulate(np.where(known, column, -1), axis=1)
+    after = np.minimum.accumulate(np.where(known, column, width)[:, ::-1], axis=1)[:, ::-1]
+    # A column of infinity on either side is what the ends of a line without a neighbour refer to.
+    padded = F.pad(disparity, (1, 1), value=torch.inf)
+    left, right = (padded.gather(1, torch.from_numpy(end + np.int64(1))) for end in (before, after))
     filled = torch.minimum(left, right)
-    empty = ~known.any(1)
+    empty = torch.from_numpy(~known.any(1))
     if bool(empty.any()):
         filled[empty] = disparity.nanmedian()
     return filled

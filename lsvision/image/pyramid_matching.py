@@ -1,15 +1,18 @@
 """Dense stereo matching from coarse to fine: the whole range on a small copy, a few disparities on a larger one.
 
-A quarter of the size holds a sixteenth of the pixels and a quarter of the disparities. What it finds is wrong by a
-pixel of its own here and there, and by a few beside an edge, where blocks see two surfaces. So around each pixel the
-nearest and the farthest surface are both tried at half the size, and the one that fits better stays. What is left to
-find, fractions of a pixel, is the work of ``refine_disparity``.
+A quarter of the size holds a sixteenth of the pixels and a quarter of the disparities. On smooth ground what it finds,
+refined, is good to half a pixel of its own, within reach of the refinement at half the size. Where that leaves more
+than noise, where the small copy found nothing, and beside an edge, where blocks see two surfaces, the nearest and the
+farthest surface around are both searched for at half the size, and what fits best stays. What is left to find,
+fractions of a pixel, is the work of ``refine_disparity``.
 """
 
 import math
+from typing import Any
 
 import cv2
 import torch
+import torch.nn.functional as F  # noqa: N812
 from jaxtyping import Float
 from torch import Tensor
 
@@ -19,6 +22,7 @@ from lsvision.image.matching import check_pair, run_sgbm, sgbm_matcher
 from lsvision.image.refinement import refine_disparity
 from lsvision.types import TensorImage
 
+BLOCK = 2  # pixels along the side of the blocks that get a disparity
 COARSEST = 4  # size of the full image over that of the smallest copy; strips should start at multiples of it
 _AROUND = (-8, 7)  # disparities tried around the coarse one, px of half the size
 # Surfaces that differ by less over a neighbourhood of the small copy, px of it, are within reach of one search.
@@ -27,7 +31,11 @@ _NEIGHBOURHOOD = 5
 _ROOM_PX = 64
 _SMOOTH_PX = 2.0  # a larger step between neighbours is an edge, over which nothing is interpolated
 _COARSE_SPECKLE = 2  # times the pixels of a speckle: what is removed here is found again at half the size
-_BAND = 64  # lines of the full size worked on at once
+# The small copy is in doubt where its refinement leaves residuals over noise that a shift by less, px of half the size,
+# does not explain, in more than so many of 255 parts of a neighbourhood.
+_DOUBTFUL_PX = 0.45
+_DOUBT_BLOCK, _DOUBT_LEVEL = 9, 48
+_WINDOW, _COARSE_WINDOW = 9, 7  # of the refinement
 _COST_BLOCK, _COST_LIMIT, _NO_MATCH = 5, 60, 255.0
 
 
@@ -46,12 +54,14 @@ def match_coarse_to_fine(
     speckle_px: int,
     noise: float,
     white: float | None = None,
-) -> Float[Tensor, "lines width"]:
-    """Disparity u_left - u_right of a pair of strips, good to a tenth of a pixel; float32 px, NaN for no match.
+) -> Float[Tensor, "rows columns"]:
+    """Disparity u_left - u_right of each 2 x 2 pixels of a pair of strips, the last ones perhaps incomplete.
+
+    In pixels of the full size, float32, and good to a fifth of one; NaN for no match. ``refine_disparity`` takes it.
 
     Args:
-        left, right: as in ``match_sgbm``, as are the range, the block, the penalties, the shares and ``white``.
-        left_right_check_px: largest disagreement of the two views on the small copy, in full pixels.
+        left, right: as in ``match_sgbm``, as are the range, the block, the penalties and ``white``.
+        left_right_check_px, uniqueness_percent: on the small copy, the former in full pixels.
         fine_check_px: largest disagreement at half the size, in full pixels.
         speckle_px: smaller patches are removed, in pixels of half the size.
         noise: standard deviation of the grey values, of 255.
@@ -70,38 +80,64 @@ def match_coarse_to_fine(
     check = round(left_right_check_px / COARSEST)
     speckle = _COARSE_SPECKLE * speckle_px
     matcher = sgbm_matcher((low, high), block_size, penalties, check, uniqueness_percent, speckle)
-    coarse = fill_from_background(run_sgbm(matcher, left_4, right_4, high))
-    if coarse is None:
-        return left.new_full((lines, width), torch.nan, dtype=torch.float32)
-    check = round(fine_check_px / 2)
-    matcher = sgbm_matcher(_AROUND, block_size, penalties, check, uniqueness_percent, 0)
-    near, far = _surfaces(coarse)
-    disparity, cost = _match_around(matcher, half_left, half_right, near, slice(0, near.shape[1]))
-    columns = _where_two(near, far)
-    if columns is not None:
-        behind, behind_cost = _match_around(matcher, half_left, half_right, far, columns)
-        better = behind_cost < cost[:, columns]
-        disparity[:, columns] = torch.where(better, behind, disparity[:, columns])
-        cost[:, columns] = torch.minimum(behind_cost, cost[:, columns])
-    disparity = agreeing(_without_speckles(disparity, speckle_px), cost, fine_check_px / 2)
-    disparity = refine_disparity(half_left, half_right, disparity, window=9, iterations=1, noise=noise).disparity
-    return _full_size(disparity, lines, width, minimum_px, maximum_px)
+    coarse = run_sgbm(matcher, left_4, right_4, high)
+    coarse = refine_disparity(left_4, right_4, coarse, window=_COARSE_WINDOW, iterations=1, noise=noise).disparity
+    filled = fill_from_background(coarse)
+    if filled is None:
+        return left.new_full((-(-lines // BLOCK), -(-width // BLOCK)), torch.nan, dtype=torch.float32)
+    near, far = _surfaces(filled)
+    # What is searched for is steep or small: changes cost less than at a quarter of the size. No check is asked of the
+    # search itself, since ``agreeing`` compares what all of them found.
+    steps = _AROUND[1] - _AROUND[0] + 1
+    matcher = sgbm_matcher(_AROUND, block_size, (penalties[0] // 2, penalties[1]), steps, 0, 0)
+    checks = speckle_px, fine_check_px / 2
+    disparity = _at_half_size(matcher, half_left, half_right, (near, far), coarse.isnan(), checks, noise)
+    disparity = disparity[: -(-lines // BLOCK), : -(-width // BLOCK)].mul(BLOCK)
+    return _within(disparity, minimum_px, maximum_px, width)
 
 
-def _full_size(half: Tensor, lines: int, width: int, minimum_px: int, maximum_px: int) -> Tensor:
-    """Disparity at full size, without what lies beyond the range or has its partner beyond the image."""
-    full = half.new_empty(lines, width)
-    column = torch.arange(width)
-    for start in range(0, lines, _BAND):
-        # A line more on either side, which the interpolation looks at.
-        above, below = max(start // 2 - 1, 0), min((start + _BAND) // 2 + 1, half.shape[0])
-        enlarged = _enlarged(2 * half[above:below], (2 * (below - above), 2 * half.shape[1]))
-        band = full[start : start + _BAND]
-        band.copy_(enlarged[start - 2 * above :, :width][: len(band)])
-        partner = column - band
-        outside = (partner < 0) | (partner > width - 1) | (band <= minimum_px - 1) | (band >= maximum_px + 1)
-        band.masked_fill_(outside, torch.nan)
-    return full
+def _at_half_size(
+    matcher: cv2.StereoSGBM,
+    left: Tensor,
+    right: Tensor,
+    surfaces: tuple[Tensor, Tensor],
+    missing: Tensor,
+    checks: tuple[int, float],
+    noise: float,
+) -> Tensor:
+    """Refined disparity at half the size, searched for only where the small copy is in doubt.
+
+    The doubt follows from the surroundings of a pixel alone, so that the result does not depend on the strip.
+    """
+    (near, far), (speckle_px, limit_px) = surfaces, checks
+    options: dict[str, Any] = {"window": _WINDOW, "iterations": 1, "noise": noise}
+    disparity = refine_disparity(left, right, near, **options, largest_sigma_px=_DOUBTFUL_PX / _WINDOW).disparity
+    wrong, two = disparity.isnan(), near > far
+    disparity = torch.where(wrong, near, disparity)
+    cost = _misfit(left, right, disparity, slice(0, near.shape[1]))
+    doubtful = _around(wrong | two | _repeated(missing, COARSEST // BLOCK))
+    for base, where in ((near, doubtful), (far, two)):
+        for columns in _stretches(where.any(0)):
+            found = _match_around(matcher, left, right, base, columns)
+            misfit = _misfit(left, right, found, columns)
+            better = (misfit < cost[:, columns]).logical_and_(where[:, columns])
+            disparity[:, columns] = torch.where(better, found, disparity[:, columns])
+            cost[:, columns] = torch.where(better, misfit, cost[:, columns])
+    disparity = agreeing(_without_speckles(disparity, speckle_px), cost, limit_px)
+    for columns in _stretches(doubtful.any(0)):
+        part, start = disparity[:, columns], columns.start
+        refined = refine_disparity(left[:, columns], right, part, first_column=start, **options).disparity
+        disparity[:, columns] = torch.where(doubtful[:, columns], refined, part)
+    return disparity
+
+
+def _within(disparity: Tensor, minimum_px: int, maximum_px: int, width: int) -> Tensor:
+    """Disparity of blocks without what lies beyond the range or has its partner beyond the image, ``width`` px wide."""
+    partner = BLOCK * torch.arange(disparity.shape[1]) + (BLOCK - 1) / 2 - disparity
+    # Both columns of a block; the lowest partner is 0, the highest width - 1.
+    seen = (partner - (width - 1) / 2).abs_() <= (width - BLOCK) / 2
+    in_range = (disparity > minimum_px - 1) & (disparity < maximum_px + 1)
+    return torch.where(seen & in_range, disparity, torch.nan)
 
 
 def _reduced(image: Tensor) -> tuple[Tensor, Tensor]:
@@ -124,26 +160,40 @@ def _surfaces(coarse: Tensor) -> tuple[Tensor, Tensor]:
     return near, far
 
 
-def _where_two(near: Tensor, far: Tensor) -> slice | None:
-    """The columns within which two surfaces are near each other, with room for a search; None where there are none."""
-    apart = (near > far).any(0).nonzero()
-    if not len(apart):
-        return None
-    return slice(max(int(apart[0]) - _ROOM_PX, 0), min(int(apart[-1]) + _ROOM_PX + 1, near.shape[1]))
+def _around(where: Tensor) -> Tensor:
+    """Pixels where a good part of a small neighbourhood is marked, and those near such pixels."""
+    marked = where.to(torch.uint8).mul_(255).numpy()
+    dense = cv2.threshold(cv2.blur(marked, (_DOUBT_BLOCK, _DOUBT_BLOCK)), _DOUBT_LEVEL, 255, cv2.THRESH_BINARY)[1]
+    kernel = cv2.getStructuringElement(cv2.MORPH_RECT, (2 * _DOUBT_BLOCK + 1, 2 * _DOUBT_BLOCK + 1))
+    return torch.from_numpy(cv2.dilate(dense, kernel)) > 0
 
 
-def _match_around(
-    matcher: cv2.StereoSGBM, left: Tensor, right: Tensor, base: Tensor, columns: slice
-) -> tuple[Tensor, Tensor]:
-    """Disparity in some columns by a search around a base, and how badly it fits: mean absolute difference by block."""
-    left, base = left[:, columns].contiguous(), base[:, columns]
+def _repeated(mask: Tensor, times: int) -> Tensor:
+    return mask.repeat_interleave(times, 0).repeat_interleave(times, 1)
+
+
+def _stretches(columns: Tensor) -> list[slice]:
+    """Stretches of marked columns with room for a search on either side."""
+    wide = F.max_pool1d(columns.float()[None], 2 * _ROOM_PX + 1, 1, _ROOM_PX)[0]
+    bounds = F.pad(wide, (1, 1)).diff().nonzero()[:, 0].view(-1, 2)
+    return [slice(start, stop) for start, stop in bounds.tolist()]
+
+
+def _match_around(matcher: cv2.StereoSGBM, left: Tensor, right: Tensor, base: Tensor, columns: slice) -> Tensor:
+    """Disparity in some columns by a search around a base."""
+    base = base[:, columns]
     column = torch.arange(columns.start, columns.stop, dtype=torch.float32)
-    disparity = base + run_sgbm(matcher, left, _sampled(right, column - base), _AROUND[1])
+    disparity = base + run_sgbm(matcher, left[:, columns], _sampled(right, column - base), _AROUND[1])
     partner = column - disparity
-    disparity = torch.where((partner > -0.5) & (partner < right.shape[1] - 0.5), disparity, torch.nan)
-    difference = cv2.absdiff(_sampled(right, torch.nan_to_num(partner)).numpy(), left.numpy())
+    return torch.where((partner > -0.5) & (partner < right.shape[1] - 0.5), disparity, torch.nan)
+
+
+def _misfit(left: Tensor, right: Tensor, disparity: Tensor, columns: slice) -> Tensor:
+    """How badly the disparity of some columns fits: mean absolute difference over a block."""
+    partner = torch.arange(columns.start, columns.stop, dtype=torch.float32) - disparity
+    difference = cv2.absdiff(_sampled(right, torch.nan_to_num(partner)).numpy(), left[:, columns].numpy())
     cost = torch.from_numpy(cv2.blur(difference.clip(max=_COST_LIMIT), (_COST_BLOCK, _COST_BLOCK))).to(torch.float32)
-    return disparity, torch.where(disparity.isnan(), _NO_MATCH, cost)
+    return torch.where(disparity.isnan(), _NO_MATCH, cost)
 
 
 def _sampled(image: Tensor, column: Tensor) -> Tensor:

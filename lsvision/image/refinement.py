@@ -9,14 +9,17 @@ import torch.nn.functional as F  # noqa: N812
 from jaxtyping import Float, Shaped
 from torch import Tensor
 
-# Worked on at once: the two dozen intermediate images then stay in the processor's cache.
-_TILE_LINES, _TILE_COLUMNS = 96, 1024
+from lsvision.image.tiling import in_parallel
+
+# Worked on at once: the dozen intermediate images of a tile then stay in the processor's cache.
+_TILE_LINES, _TILE_COLUMNS = 192, 512
 _SAME_SURFACE_PX = 0.5  # from a window's mean
 _ROUNDING = 1.0 / 6.0  # variance of the difference of two whole grey values
 # Variance of half the difference of two neighbours over that of the residual: half a pixel's noise, over one pixel's
 # and that of another which interpolation has smoothed to 0.6 of it on average.
 _SLOPE_NOISE = 0.5 / 1.6
 _NOISE_RESIDUAL = 4.0  # times the noise's variance in one image; two have twice of it
+_SMOOTH_PX = 4.0  # an interpolated value that differs by more from its block's own one mixes two surfaces
 
 
 @dataclass(frozen=True)
@@ -29,9 +32,10 @@ class RefinedDisparity:
 
 def refine_disparity(
     left: Shaped[Tensor, "lines width"],
-    right: Shaped[Tensor, "lines width"],
-    disparity: Float[Tensor, "lines width"],
+    right: Shaped[Tensor, "lines right_width"],
+    disparity: Float[Tensor, "rows columns"],
     *,
+    first_column: int = 0,
     window: int,
     iterations: int,
     noise: float,
@@ -46,35 +50,93 @@ def refine_disparity(
 
     The standard deviation follows from the residuals left in the window and the texture that holds the disparity.
 
+    A disparity for each 2 x 2 pixels, the last ones perhaps incomplete, is refined by all pixels of the images and
+    interpolated at the end: neighbouring windows share most of their pixels and say little that is new.
+
     Args:
         left, right: grey values of the pair.
-        window: side of the square window, px, odd.
+        disparity: px of the images, one value a pixel of the left one or a block of 2 x 2.
+        first_column: of the right image is where the left one begins, which may be a part of it.
+        window: side of the square window, px, odd; rounded up to an odd number of blocks.
         iterations: at least one.
         noise: standard deviation of the grey values' noise, on their scale.
         largest_change_px: a larger total change is not believed and undone.
         largest_sigma_px: a pixel known less well is dropped, unless its residual is no more than noise: ground without
             texture says little, but a wrong match says the wrong thing.
 
+    Returns:
+        Values for each pixel of the left image.
+
+    Raises:
+        ValueError: the disparity has neither one value a pixel nor one a block.
+
     Source: Lucas & Kanade 1981, in one dimension; Baker & Matthews 2004 for the slope of the image that is not warped.
     """
-    (lines, width), reach = disparity.shape, 2 * iterations * (window // 2)
-    refined, sigma = torch.empty_like(disparity), torch.empty_like(disparity)
+    block, (lines, width) = _block(left, disparity), left.shape
+    window = 2 * (window // (2 * block)) + 1
+    reach = 2 * iterations * (window // 2) + block - 1  # interpolation looks one block further
+    refined, sigma = (disparity.new_empty(lines, width) for _ in range(2))
     scatter, largest = _scatter_gain(window, iterations), largest_sigma_px or math.inf
-    for above, start, stop, below in _tiles(lines, _TILE_LINES, reach):
-        pair = left[above:below].to(disparity.dtype), right[above:below].to(disparity.dtype)
-        for before, first, last, after in _tiles(width, _TILE_COLUMNS, reach):
-            tile = slice(start, stop), slice(first, last)
-            inner = slice(start - above, stop - above), slice(first - before, last - before)
+
+    def refine_rows(rows: tuple[int, int, int, int]) -> None:
+        above, start, stop, below = rows
+        left_rows, right_rows = (_whole_blocks(image, above, below, block) for image in (left, right))
+        for before, first, last, after in _tiles(disparity.shape[1], _TILE_COLUMNS // block, reach):
             outer = disparity[above:below, before:after]
-            current, deviation, residual = (
-                values[inner] for values in _refine_tile(pair, outer, before, window, iterations, noise)
-            )
-            torch.mul(deviation, scatter, out=sigma[tile])
-            torch.add(disparity[tile], _small(current - disparity[tile], largest_change_px), out=refined[tile])
-            dropped = (sigma[tile] > largest) & (residual > _NOISE_RESIDUAL * noise**2)
-            for values in (refined, sigma):
-                values[tile].masked_fill_(dropped, torch.nan)
+            pair = left_rows[:, block * before : block * after], right_rows
+            column = first_column + block * before
+            current, deviation, residual = _refine_tile(pair, outer, column, window, iterations, noise)
+            current = outer + _small(current.sub_(outer), largest_change_px)
+            deviation.mul_(scatter)
+            current.masked_fill_((deviation > largest).logical_and_(residual > _NOISE_RESIDUAL * noise**2), torch.nan)
+            tile = slice(block * start, block * stop), slice(block * first, block * last)
+            into = refined[tile], sigma[tile]
+            rest = [slice(block * (begin - out), None) for begin, out in ((start, above), (first, before))]
+            inner = tuple(slice(skip.start, skip.start + n) for skip, n in zip(rest, into[0].shape, strict=True))
+            into[0].copy_(enlarged(current, block)[inner])
+            torch.add(into[0] - into[0], _repeated(deviation, block)[inner], out=into[1])
+
+    in_parallel(refine_rows, _tiles(disparity.shape[0], _TILE_LINES // block, reach))
     return RefinedDisparity(refined, sigma)
+
+
+def enlarged(disparity: Float[Tensor, "rows columns"], block: int) -> Float[Tensor, "lines width"]:
+    """A value for each pixel of the blocks: interpolated on one surface, the block's own beside an edge or a gap."""
+    if block == 1:
+        return disparity
+    own = _repeated(disparity, block)
+    size = own.shape[1], own.shape[0]
+    smooth = torch.from_numpy(cv2.resize(disparity.numpy(), size, interpolation=cv2.INTER_LINEAR))
+    # A comparison with NaN is false.
+    return torch.where((smooth - own).abs_() < _SMOOTH_PX, smooth, own)
+
+
+def _block(image: Tensor, disparity: Tensor) -> int:
+    """Pixels along the side of a disparity's block."""
+    for block in (1, 2):
+        if tuple(disparity.shape) == tuple(-(-size // block) for size in image.shape):
+            return block
+    raise ValueError(
+        f"disparity must have a value for each pixel or each 2 x 2 pixels of images {tuple(image.shape)}, "
+        f"got {tuple(disparity.shape)}"
+    )
+
+
+def _whole_blocks(image: Tensor, above: int, below: int, block: int) -> Tensor:
+    """Grey values of some rows of blocks as float32, the edge repeated where the last blocks are incomplete."""
+    values = image[block * above : block * below].to(torch.float32)
+    bottom, right = block * (below - above) - values.shape[0], -values.shape[1] % block
+    if bottom or right:
+        values = torch.from_numpy(cv2.copyMakeBorder(values.numpy(), 0, bottom, 0, right, cv2.BORDER_REPLICATE))
+    return values
+
+
+def _repeated(values: Tensor, block: int) -> Tensor:
+    """The value of its block for each pixel."""
+    if block == 1:
+        return values
+    size = block * values.shape[1], block * values.shape[0]
+    return torch.from_numpy(cv2.resize(values.numpy(), size, interpolation=cv2.INTER_NEAREST))
 
 
 def _tiles(length: int, size: int, reach: int) -> list[tuple[int, int, int, int]]:
@@ -83,48 +145,70 @@ def _tiles(length: int, size: int, reach: int) -> list[tuple[int, int, int, int]
     return [(max(s - reach, 0), s, min(s + size, length), min(s + size + reach, length)) for s in starts]
 
 
+@dataclass(frozen=True)
+class _Windows:
+    """Square windows over the blocks of a tile that have a disparity."""
+
+    known: Tensor  # 1 where there is one, 0 elsewhere
+    count: Tensor  # of known blocks within the window
+    size: int
+
+    @classmethod
+    def over(cls, known: Tensor, size: int) -> "_Windows":
+        """Windows of ``size`` blocks a side."""
+        return cls(known, _window_sum(known, size).clamp_(min=0.5), size)
+
+    def mean(self, values: Tensor) -> Tensor:
+        """Mean over the known blocks of each window of a value for each block, or of one for each pixel."""
+        size = self.known.shape[1], self.known.shape[0]
+        if values.shape != self.known.shape:
+            values = torch.from_numpy(cv2.resize(values.numpy(), size, interpolation=cv2.INTER_AREA))
+        return _window_sum(values * self.known, self.size).div_(self.count)
+
+
 def _refine_tile(
     pair: tuple[Tensor, Tensor], disparity: Tensor, column: int, window: int, iterations: int, noise: float
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Refined disparity, the standard deviation of one least-squares step, and the residual's variance.
+    """Refined disparity, the standard deviation of one least-squares step, and the residual's variance, by block.
 
-    The disparity begins at ``column`` of the images, which are whole: a partner may lie anywhere.
+    The left image begins at ``column`` of the right one, which is whole: a partner may lie anywhere.
     """
-    left, right = pair[0][:, column : column + disparity.shape[1]], pair[1]
-    missing = disparity - disparity  # NaN where there is none
-    known = (missing == 0).to(left.dtype)
+    left, right = pair
+    block = left.shape[0] // disparity.shape[0]
+    windows = _Windows.over((disparity == disparity).to(left.dtype), window)  # unknown where it is NaN
     current = torch.nan_to_num(disparity)
-    count = _window_sum(known, window).clamp_(min=0.5)
     # The left image's slope: its noise is independent of the right one's, which interpolation smooths between pixels,
     # and a slope that shares that noise would pull disparities towards the middle between them.
-    slope = F.pad(left[:, 2:] - left[:, :-2], (1, 1)).mul_(0.5).mul_(known)
-    mean_slope = _window_sum(slope, window).div_(count)
-    texture = _window_sum(slope * slope, window).div_(count).addcmul_(mean_slope, mean_slope, value=-1)
+    slope = F.pad(left[:, 2:] - left[:, :-2], (1, 1)).mul_(0.5)
+    mean_slope = windows.mean(slope)
+    texture = windows.mean(slope * slope).addcmul_(mean_slope, mean_slope, value=-1)
     # The window's mean of noise times slope; the prior keeps untextured ground where matching put it.
-    prior = 4.0 * noise**2 / window**2
+    prior = 4.0 * noise**2 / (block * window) ** 2
     energy = texture + prior
     for _ in range(iterations):
-        current = _smoothed(current, known, count, window)
-        residual = (left - _warp_rows(right, current, column)).mul_(known)
-        mean_residual = _window_sum(residual, window).div_(count)
-        pull = _window_sum(slope * residual, window).div_(count).addcmul_(mean_slope, mean_residual, value=-1)
+        current = _smoothed(current, windows)
+        residual = _warp_rows(right, enlarged(current, block), column)
+        torch.sub(left, residual, out=residual)
+        mean_residual = windows.mean(residual)
+        pull = windows.mean(slope * residual).addcmul_(mean_slope, mean_residual, value=-1)
         step = pull / energy
-        current = current - step.clamp(-0.5, 0.5)
-    spread = _window_sum(residual * residual, window).div_(count).addcmul_(mean_residual, mean_residual, value=-1)
-    unexplained = spread.addcmul_(pull, step, value=-1).mul_(count / (count - 2).clamp_(min=1)).clamp_(min=_ROUNDING)
+        current.sub_(step.clamp(-0.5, 0.5))
+    spread = windows.mean(residual.square_()).addcmul_(mean_residual, mean_residual, value=-1)
+    count = windows.count.mul_(block**2)
+    freedom = (count - 2).clamp_(min=1)
+    unexplained = spread.addcmul_(pull, step, value=-1).mul_(count).div_(freedom).clamp_(min=_ROUNDING)
     # The slope's own noise looks like texture but holds nothing.
     held = texture.sub_(unexplained, alpha=_SLOPE_NOISE).clamp_(min=0).add_(prior)
-    sigma = (unexplained * energy.clamp_(min=0)).div_(count).sqrt_().div_(held)
-    return current.add_(missing), sigma.add_(missing), unexplained
+    sigma = energy.clamp_(min=0).mul_(unexplained).div_(count).sqrt_().div_(held)
+    return current, sigma, unexplained
 
 
-def _smoothed(current: Tensor, known: Tensor, count: Tensor, window: int) -> Tensor:
+def _smoothed(current: Tensor, windows: _Windows) -> Tensor:
     """Disparity averaged over the window, but where that would mix two surfaces.
 
     The windows warp each pixel by its own disparity, which follows slanted ground; its noise would stay, however.
     """
-    change = _window_sum(current * known, window) / count - current
-    return current + _small(change, _SAME_SURFACE_PX)
+    return _small(windows.mean(current).sub_(current), _SAME_SURFACE_PX).add_(current)
 
 
 def _small(change: Tensor, limit: float) -> Tensor:
@@ -152,13 +236,15 @@ def _scatter_gain(window: int, iterations: int) -> float:
 def _warp_rows(image: Tensor, disparity: Tensor, column: int = 0) -> Tensor:
     """Values of an image at u - disparity along each line, u from ``column`` on, by Catmull-Rom interpolation."""
     width, stop = image.shape[1], column + disparity.shape[1]
-    position = (torch.arange(column, stop, dtype=disparity.dtype) - disparity).clamp_(1.0, width - 2.0)
+    position = torch.arange(column, stop, dtype=disparity.dtype).sub(disparity).clamp_(1.0, width - 2.0)
     base = position.floor().clamp_(max=width - 3)
-    t = position - base
-    index = base.long()
-    a, b, c, d = (image.gather(1, index + shift) for shift in (-1, 0, 1, 2))
-    linear, quadratic, cubic = c - a, 2 * a - 5 * b + 4 * c - d, 3 * (b - c) + d - a
-    return b + 0.5 * t * (linear + t * (quadratic + t * cubic))
+    t = position.sub_(base)
+    index = base.sub_(1.0).long()
+    # One index into views that begin a pixel apart.
+    a, b, c, d = (image[:, shift:].gather(1, index) for shift in range(4))
+    linear, cubic = c - a, d.sub_(a).add_(b, alpha=3).sub_(c, alpha=3)
+    quadratic = a.sub_(b).mul_(2).add_(linear).sub_(cubic)
+    return b.addcmul_(t, linear.addcmul_(t, quadratic.addcmul_(t, cubic)), value=0.5)
 
 
 def _window_sum(values: Tensor, window: int) -> Tensor:

@@ -14,7 +14,7 @@ from lsvision.image.agreement import occluded
 from lsvision.image.brightness import gray, gray_bytes, white_level
 from lsvision.image.matching import match_sgbm
 from lsvision.image.pyramid_matching import COARSEST, match_coarse_to_fine
-from lsvision.image.refinement import refine_disparity
+from lsvision.image.refinement import enlarged, refine_disparity
 from lsvision.types import LineImage, Rig, Scan, TensorImage
 
 
@@ -89,6 +89,8 @@ def measure_strip(
     white = white or white_level(TensorImage(left), TensorImage(right))
     disparity = _search(left, right, rig, config, white)
     if config.refine_iterations == 0:
+        lines, width = left.shape[:2]
+        disparity = enlarged(disparity, -(-lines // disparity.shape[0]))[:lines, :width]
         return StripMatch(disparity, torch.full_like(disparity, torch.nan))
     refined = refine_disparity(
         _gray(left, white),

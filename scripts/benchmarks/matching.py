@@ -12,6 +12,7 @@ import cv2
 import torch
 from torch import Tensor
 
+from lsvision.image.tiling import keep_freed_memory
 from lsvision.simulation import MotionConfig, SceneConfig, SensorConfig, simulate
 from lsvision.stages.disparity import DisparityConfig, StripMatch, measure_strip
 from lsvision.types import Board, Rig
@@ -30,6 +31,7 @@ def run() -> dict[str, object]:
     """Throughput and errors of both on either scene; ``ratio`` is that of the rail, by the best turn of each."""
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
+    keep_freed_memory()
     scenes = {name: _compare(scene) for name, scene in SCENES.items()}
     return {"ratio": scenes["rail"]["ratio"], "scenes": scenes}
 

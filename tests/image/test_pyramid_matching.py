@@ -76,6 +76,28 @@ def test_both_surfaces_beside_an_edge(step):
     assert (error[:, beside] < 1).float().mean() > 0.85
 
 
+def test_small_pits_are_found_where_the_small_copy_sees_none():
+    generator = torch.Generator().manual_seed(3)
+    right = textured(256, 880)[..., 0].float()
+    v, u = torch.meshgrid(torch.arange(256.0), torch.arange(800.0), indexing="ij")
+    distance = ((u % 100 - 50).square() + (v % 64 - 32).square()).sqrt()  # from the nearest pit's middle
+    truth = torch.where(distance < 14, 7.0, 4.0)
+    left = right.gather(1, (u - truth + 40).long())
+    noisy = (image + 2 * torch.randn(image.shape, generator=generator) for image in (left, right[:, 40:840]))
+    disparity = match(*(image.clamp(0, 255).round().to(torch.uint8)[..., None] for image in noisy))
+    inside = ((disparity - truth)[distance < 12]).abs()
+    assert (inside <= 1).float().mean() > 0.75
+    assert (inside > 1).float().mean() < 0.1
+
+
+def test_odd_sizes_have_a_value_for_each_incomplete_block():
+    left, right = (image[:95, :279] for image in pair(6))
+    start = match_coarse_to_fine(left, right, minimum_px=-40, maximum_px=40, fine_check_px=4, noise=1.0, **OPTIONS)
+    assert start.shape == (48, 140)
+    assert (start[:, 10:-3] - 6).abs().nanmedian() < 0.1
+    assert match(left, right).shape == (95, 279)
+
+
 def test_nothing_is_invented():
     assert torch.isfinite(match(*pair(20), -9, 9)).float().mean() < 0.05
     left, right = pair(5)

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from lsvision.image.matching import match_sgbm
-from lsvision.image.refinement import _warp_rows, refine_disparity
+from lsvision.image.refinement import _warp_rows, enlarged, refine_disparity
 from tests.image.test_matching import OPTIONS
 
 LINES, WIDTH = 64, 240
@@ -106,3 +106,39 @@ def test_warp_by_hand():
     expected = (torch.arange(7.0)[None] - 0.5) ** 2
     torch.testing.assert_close(_warp_rows(image, torch.full((1, 7), 0.5))[:, 2:6], expected[:, 2:6])
     torch.testing.assert_close(_warp_rows(image, torch.full((1, 7), -1.0))[:, 1:5], image[:, 2:6])
+
+
+def test_blocks_of_pixels_are_refined_by_all_their_pixels():
+    slope = 4.0 / WIDTH
+    truth = (torch.arange(WIDTH).float() * slope).expand(LINES, WIDTH)
+    left, right = texture(-truth, 0.5), texture(torch.tensor(0.0), 0.5)
+    start = truth[::2, ::2].round()
+    for lines, width in ((LINES, WIDTH), (LINES - 1, WIDTH - 1)):
+        refined = refine(left[:lines, :width], right[:lines, :width], start, **REFINE)
+        assert refined.shape == (lines, width)
+        error = (refined - truth[:lines, :width])[INSIDE]
+        assert error.square().mean().sqrt() < 0.05
+        assert abs(error.mean()) < 0.005
+    with pytest.raises(ValueError, match="2 x 2"):
+        refine(left, right, start[1:], **REFINE)
+
+
+@pytest.mark.parametrize("block", [1, 2])
+def test_a_part_of_the_left_image_finds_its_partners_in_the_whole_right_one(block):
+    left, right = texture(torch.tensor(0.0), 0.5), texture(torch.tensor(7.3), 0.5)
+    start = torch.full((LINES, WIDTH), 7.0)[::block, ::block]
+    first = 80
+    part = refine(left[:, first:160], right, start[:, first // block : 160 // block], first_column=first, **REFINE)
+    whole = refine(left, right, start, **REFINE)[:, first:160]
+    margin = 20
+    torch.testing.assert_close(part[:, margin:-margin], whole[:, margin:-margin], rtol=0, atol=1e-4)
+
+
+def test_an_edge_between_blocks_stays_sharp():
+    disparity = torch.tensor([[2.0, 2.0, 32.0, math.nan], [2.4, 2.4, 32.0, math.nan]])
+    pixels = enlarged(disparity, 2)
+    assert pixels.shape == (4, 8)
+    torch.testing.assert_close(pixels[:, 0], torch.tensor([2.0, 2.1, 2.3, 2.4]))
+    assert (pixels[:, 4:6] == 32.0).all()
+    assert (pixels[:, 2:4] < 3.0).all()
+    assert pixels[:, 6:].isnan().all()
