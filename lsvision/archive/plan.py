@@ -38,7 +38,7 @@ class Processing:
     @property
     def with_sigma(self) -> bool:
         """Whether the standard deviation of the matched depth is kept with it."""
-        return self.correction.uncertainty and self.disparity.refine_iterations > 0
+        return self.correction.uncertainty and self.disparity.tells_sigma
 
     @property
     def sha256(self) -> str:

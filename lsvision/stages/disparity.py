@@ -2,7 +2,7 @@
 
 import math
 from collections import OrderedDict
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, Literal
 
@@ -17,23 +17,26 @@ from lsvision.image.pyramid_matching import COARSEST, match_coarse_to_fine
 from lsvision.image.refinement import enlarged, refine_disparity
 from lsvision.types import LineImage, Rig, Scan, TensorImage
 
+_COARSE_TO_FINE_PX = 1500  # from this width on a quarter of the size is enough to search in
+
 
 @dataclass(frozen=True)
 class DisparityConfig:
-    """How two images are matched; the default is semi-global matching at the paper's settings.
+    """How two images are matched.
 
-    ``matcher`` is ``sgbm``, one pass over the whole range, or ``coarse_to_fine``, the whole range at a quarter of the
-    size and a few disparities at half of it. The search range is given in heights over the plane of zero disparity, mm,
-    positive towards the cameras: -26.9..25.2 is -165..+165 px on the full 3DPIXA and the same 52 mm on any other rig.
-    ``lambda1`` and ``lambda2`` penalise a change of disparity by one and by more, per pixel of the block.
+    ``matcher`` is ``sgbm``, one pass over the whole range as in the paper, ``coarse_to_fine``, the whole range at a
+    quarter of the size and a few disparities at half of it, or ``auto``: the latter from 1500 px a line on, below which
+    too little is left at a quarter of the size. The search range is given in heights over the plane of zero disparity,
+    mm, positive towards the cameras: -26.9..25.2 is -165..+165 px on the full 3DPIXA and the same 52 mm on any other
+    rig. ``lambda1`` and ``lambda2`` penalise a change of disparity by one and by more, per pixel of the block.
     ``left_right_check_px`` is the largest disagreement of the two views, ``fine_check_px`` that of the finer search.
-    ``refine_iterations`` of local least squares over a window of ``refine_window`` px follow; 0 leaves the matcher's
-    own sixteenths of a pixel, which lean towards whole ones. A pixel that is then known no better than
-    ``largest_sigma_px``, though its residual is more than noise, is dropped. ``strip_lines`` are matched at once, with
-    ``halo_lines`` beyond either end that are thrown away.
+    ``refine_iterations`` of local least squares over a window of ``refine_window`` px follow, as many as the matcher
+    needs where it is None; 0 leaves the sixteenths of a pixel of ``sgbm``, which lean towards whole ones. A pixel that
+    is then known no better than ``largest_sigma_px``, though its residual is more than noise, is dropped.
+    ``strip_lines`` are matched at once, with ``halo_lines`` beyond either end that are thrown away.
     """
 
-    matcher: Literal["sgbm", "coarse_to_fine"] = "sgbm"
+    matcher: Literal["auto", "sgbm", "coarse_to_fine"] = "auto"
     height_range_mm: tuple[float, float] = (-26.9, 25.2)
     block_size: int = 5
     lambda1: float = 8.0
@@ -42,12 +45,27 @@ class DisparityConfig:
     fine_check_px: int = 4
     uniqueness_percent: int = 5
     speckle_px: int = 100
-    refine_iterations: int = 2
+    refine_iterations: int | None = None
     refine_window: int = 9
     refine_noise: float = 2.0  # grey values, of 255
     largest_sigma_px: float | None = None
     strip_lines: int = 512
-    halo_lines: int = 24
+    halo_lines: int = 48
+
+    @property
+    def tells_sigma(self) -> bool:
+        """Whether the standard deviation of a disparity is known: refinement tells it."""
+        return self.refine_iterations != 0
+
+    def for_width(self, width: int) -> "DisparityConfig":
+        """The same with what is left open settled for lines of ``width`` px."""
+        matcher = self.matcher
+        if matcher == "auto":
+            matcher = "coarse_to_fine" if width >= _COARSE_TO_FINE_PX else "sgbm"
+        iterations = self.refine_iterations
+        if iterations is None:
+            iterations = 1 if matcher == "coarse_to_fine" else 2  # the former has refined already, at half the size
+        return replace(self, matcher=matcher, refine_iterations=iterations)
 
 
 @dataclass(frozen=True)
@@ -86,9 +104,10 @@ def measure_strip(
     Nothing is found where one of the cameras saw no more than its noise. The first line should lie at a multiple of
     four of the scan's, and ``white`` be the whole scan's (see ``white_level``), for the same result whatever the strip.
     """
+    config = config.for_width(left.shape[1])
     white = white or white_level(TensorImage(left), TensorImage(right))
     disparity = _search(left, right, rig, config, white)
-    if config.refine_iterations == 0:
+    if not config.refine_iterations:
         lines, width = left.shape[:2]
         disparity = enlarged(disparity, -(-lines // disparity.shape[0]))[:lines, :width]
         return StripMatch(disparity, torch.full_like(disparity, torch.nan))

@@ -34,7 +34,7 @@ class MatchedSigma:
 
 def sigma_of(depth: LineImage) -> LineImage | None:
     """The standard deviation of a depth map where its matcher tells it."""
-    if isinstance(depth, MatchedDepth) and depth.config.refine_iterations > 0:
+    if isinstance(depth, MatchedDepth) and depth.config.tells_sigma:
         return MatchedSigma(depth)
     return None
 

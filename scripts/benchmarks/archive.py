@@ -85,7 +85,7 @@ def _reprocess(root: Path, calibration: Path, output: Path, *options: str) -> fl
         [
             sys.executable, "-m", "lsvision.run", "+experiment=reprocess", f"archive={root / 'archive'}",
             f"calibration={calibration}", f"output={output}", f"hydra.run.dir={root / 'run'}",
-            "stages/disparity@disparity=coarse_to_fine", *options,
+            *options,
         ],
         check=True, stdout=subprocess.DEVNULL,
     )  # fmt: skip

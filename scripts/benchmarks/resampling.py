@@ -162,7 +162,7 @@ def scan_speeds() -> tuple[float, float]:
             pass
 
     def one_pass() -> None:
-        depth = MatchedDepth(scan, replace(DisparityConfig(), refine_iterations=0)).read(0, scan.lines)
+        depth = MatchedDepth(scan, replace(DisparityConfig(), matcher="sgbm", refine_iterations=0)).read(0, scan.lines)
         cv2.remap(left.tensor.numpy(), *maps, cv2.INTER_CUBIC)
         cv2.remap(depth.numpy(), *maps, cv2.INTER_LINEAR)
 

@@ -54,7 +54,7 @@ def test_disparity_at_full_size(kind):
         ratio = (within.abs() / match.sigma[close]).nanmedian() / 0.6745
         return known.double().mean(), (known & ~close).double().mean(), within, ratio
 
-    peer = figures(DisparityConfig(refine_iterations=0))
+    peer = figures(DisparityConfig(matcher="sgbm", refine_iterations=0))
     ours = figures(DisparityConfig(matcher="coarse_to_fine", refine_iterations=1, largest_sigma_px=0.5, halo_lines=48))
     assert ours[0] > peer[0] - 0.004
     assert ours[1] < max(peer[1], 0.0012)
