@@ -12,6 +12,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
+import cv2
 import torch
 
 from lsvision.archive import (
@@ -39,7 +40,7 @@ RIG = Rig(1786, 40.0, 113.84, 354.0, 260.125, 1524.375)
 SCANS, LINES = 2, 4096
 TURNS = 3
 WORKER_MEMORY_MB = 2048
-PROCESSING = Processing(DisparityConfig(), CorrectionConfig(), False, WORKER_MEMORY_MB)
+PROCESSING = Processing(DisparityConfig(matcher="sgbm"), CorrectionConfig(), False, WORKER_MEMORY_MB)
 
 
 @dataclass(frozen=True)
@@ -121,6 +122,7 @@ def started(make: Callable[[], Engine], workers: int) -> Iterator[Engine]:
 def run() -> dict[str, object]:
     """Lines a second of the bare stages and of every engine, medians of turns taken one after the other."""
     torch.set_num_threads(1)
+    cv2.setNumThreads(1)
     keep_freed_memory()  # as the command that corrects one scan does, and every worker
     engines: dict[str, tuple[Callable[[], Engine], int]] = {
         "local_1": (lambda: LocalEngine(1), 1),
