@@ -89,8 +89,8 @@ def _matching(planned: PlannedScan, place: Place, depth: Path, key: str) -> list
     config, with_sigma = place.processing.disparity, place.processing.with_sigma
     if not depth.is_dir():
         place.ledger.forget_strips(planned.key, "disparity")
-        create_depth_store(depth, planned.lines, planned.width, config.strip_lines, with_sigma=with_sigma)
-    count = -(-planned.lines // config.strip_lines)
+        create_depth_store(depth, planned.lines, planned.width, config.work_lines, with_sigma=with_sigma)
+    count = -(-planned.lines // config.work_lines)
     files = _files(planned, place)
     work = [MatchStrip(files, number, str(depth), config, with_sigma) for number in range(count)]
     return _missing(planned, place, "disparity", key, work)

@@ -85,9 +85,9 @@ class MatchStrip:
     def run(self) -> TaskResult:
         """Match the strip."""
         scan = _open_scan(self.scan)
-        start = self.number * self.config.strip_lines
-        stop = min(start + self.config.strip_lines, scan.lines)
-        matched = MatchedDepth(scan, self.config, kept_strips=1)
+        start = self.number * self.config.work_lines
+        stop = min(start + self.config.work_lines, scan.lines)
+        matched = MatchedDepth(scan, self.config, kept_blocks=1)
         z = matched.read(start, stop)[..., 0]
         _open_array(f"{self.depth}/{DEPTH}")[start:stop] = z.numpy()
         if self.with_sigma:

@@ -9,11 +9,12 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
+from lsvision.errors import ConfigError
 from lsvision.geometry import triangulate
 from lsvision.image.agreement import occluded
 from lsvision.image.brightness import gray, gray_bytes, white_level
 from lsvision.image.matching import match_sgbm
-from lsvision.image.pyramid_matching import COARSEST, match_coarse_to_fine
+from lsvision.image.pyramid_matching import match_coarse_to_fine
 from lsvision.image.refinement import enlarged, refine_disparity
 from lsvision.types import LineImage, Rig, Scan, TensorImage
 
@@ -33,7 +34,9 @@ class DisparityConfig:
     ``refine_iterations`` of local least squares over a window of ``refine_window`` px follow, as many as the matcher
     needs where it is None; 0 leaves the sixteenths of a pixel of ``sgbm``, which lean towards whole ones. A pixel that
     is then known no better than ``largest_sigma_px``, though its residual is more than noise, is dropped.
-    ``strip_lines`` are matched at once, with ``halo_lines`` beyond either end that are thrown away.
+    ``block_lines`` are matched as one, with ``halo_lines`` beyond either end that are thrown away: blocks lie at
+    multiples of their size in the scan, so that a line's disparity depends on nothing else. Workers take
+    ``strip_lines`` at once, rounded up to whole blocks.
     """
 
     matcher: Literal["auto", "sgbm", "coarse_to_fine"] = "auto"
@@ -49,8 +52,19 @@ class DisparityConfig:
     refine_window: int = 9
     refine_noise: float = 2.0  # grey values, of 255
     largest_sigma_px: float | None = None
-    strip_lines: int = 512
+    block_lines: int = 1024
     halo_lines: int = 48
+    strip_lines: int = 1024
+
+    def __post_init__(self) -> None:
+        for name, least in (("block_lines", 1), ("strip_lines", 1), ("halo_lines", 0)):
+            if getattr(self, name) < least:
+                raise ConfigError(f"disparity.{name}: expected at least {least}, got {getattr(self, name)}")
+
+    @property
+    def work_lines(self) -> int:
+        """Lines that a worker takes at once: whole blocks."""
+        return -(-self.strip_lines // self.block_lines) * self.block_lines
 
     @property
     def tells_sigma(self) -> bool:
@@ -96,16 +110,30 @@ def match_strip(left: Tensor, right: Tensor, rig: Rig, config: DisparityConfig) 
     return measure_strip(left, right, rig, config).disparity
 
 
-def measure_strip(
-    left: Tensor, right: Tensor, rig: Rig, config: DisparityConfig, white: float | None = None
-) -> StripMatch:
+def measure_strip(left: Tensor, right: Tensor, rig: Rig, config: DisparityConfig) -> StripMatch:
     """Disparity of a pair of strips ``(lines, width, channels)`` and how well it is known.
 
-    Nothing is found where one of the cameras saw no more than its noise. The first line should lie at a multiple of
-    four of the scan's, and ``white`` be the whole scan's (see ``white_level``), for the same result whatever the strip.
+    Nothing is found in a block where one of the cameras saw no more than its noise.
     """
-    config = config.for_width(left.shape[1])
-    white = white or white_level(TensorImage(left), TensorImage(right))
+    pair = TensorImage(left), TensorImage(right)
+    white = white_level(*pair)
+    blocks = [_measure_block(*pair, rig, config, white, index) for index in range(-(-len(left) // config.block_lines))]
+    return StripMatch(torch.cat([block.disparity for block in blocks]), torch.cat([block.sigma for block in blocks]))
+
+
+def _measure_block(
+    left: LineImage, right: LineImage, rig: Rig, config: DisparityConfig, white: float, index: int
+) -> StripMatch:
+    """Disparity of the block of some index, of images of any length."""
+    start, lines = index * config.block_lines, left.shape[0]
+    stop = min(start + config.block_lines, lines)
+    above, below = max(start - config.halo_lines, 0), min(stop + config.halo_lines, lines)
+    match = _measure(left.read(above, below), right.read(above, below), rig, config.for_width(left.shape[1]), white)
+    inner = slice(start - above, stop - above)
+    return StripMatch(match.disparity[inner], match.sigma[inner])
+
+
+def _measure(left: Tensor, right: Tensor, rig: Rig, config: DisparityConfig, white: float) -> StripMatch:
     disparity = _search(left, right, rig, config, white)
     if not config.refine_iterations:
         lines, width = left.shape[:2]
@@ -164,14 +192,13 @@ def depth_sigma(depth: Tensor, sigma: Tensor, rig: Rig) -> Tensor:
 class MatchedDepth:
     """The depth map of a stereo scan as a ``LineImage``: float32 z in mm, NaN for none, matched where it is read.
 
-    Strips lie at fixed multiples of ``strip_lines``, so a line's depth does not depend on the range it is read in. The
-    last strips stay in memory, since neighbouring reads overlap.
+    The last blocks stay in memory, since neighbouring reads overlap.
     """
 
     scan: Scan
     config: DisparityConfig = field(default_factory=DisparityConfig)
-    kept_strips: int = 6
-    _strips: OrderedDict[int, Tensor] = field(default_factory=OrderedDict, init=False, repr=False)
+    kept_blocks: int = 3
+    _blocks: OrderedDict[int, Tensor] = field(default_factory=OrderedDict, init=False, repr=False)
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -192,19 +219,18 @@ class MatchedDepth:
         return self._read(start, stop)[1, :, :, None]
 
     def _read(self, start: int, stop: int) -> Tensor:
-        first = start // self.config.strip_lines
-        last = (stop - 1) // self.config.strip_lines
-        strips = torch.cat([self._strip(index) for index in range(first, last + 1)], dim=1)
-        offset = first * self.config.strip_lines
-        return strips[:, start - offset : stop - offset]
+        size = self.config.block_lines
+        first, last = start // size, (stop - 1) // size
+        blocks = torch.cat([self._block(index) for index in range(first, last + 1)], dim=1)
+        return blocks[:, start - first * size : stop - first * size]
 
-    def _strip(self, index: int) -> Tensor:
-        if index not in self._strips:
-            self._strips[index] = self._match(index)
-            while len(self._strips) > self.kept_strips:
-                self._strips.popitem(last=False)
-        self._strips.move_to_end(index)
-        return self._strips[index]
+    def _block(self, index: int) -> Tensor:
+        if index not in self._blocks:
+            self._blocks[index] = self._match(index)
+            while len(self._blocks) > self.kept_blocks:
+                self._blocks.popitem(last=False)
+        self._blocks.move_to_end(index)
+        return self._blocks[index]
 
     @cached_property
     def _white(self) -> float:
@@ -214,20 +240,9 @@ class MatchedDepth:
     def _match(self, index: int) -> Tensor:
         """Depth and its standard deviation, (2, lines, width)."""
         assert self.scan.right is not None
-        start = index * self.config.strip_lines
-        stop = min(start + self.config.strip_lines, self.scan.lines)
-        above, below = max(start - self.config.halo_lines, 0), min(stop + self.config.halo_lines, self.scan.lines)
-        above -= above % COARSEST  # the blocks of the reduced copies are the same in every strip
-        match = measure_strip(
-            self.scan.left.read(above, below),
-            self.scan.right.read(above, below),
-            self.scan.rig,
-            self.config,
-            self._white,
-        )
-        inner = slice(start - above, stop - above)
-        depth = depth_from_disparity(match.disparity[inner], self.scan.rig)
-        return torch.stack([depth, depth_sigma(depth, match.sigma[inner], self.scan.rig)])
+        match = _measure_block(self.scan.left, self.scan.right, self.scan.rig, self.config, self._white, index)
+        depth = depth_from_disparity(match.disparity, self.scan.rig)
+        return torch.stack([depth, depth_sigma(depth, match.sigma, self.scan.rig)])
 
 
 def depth_of(scan: Scan, config: DisparityConfig) -> LineImage:

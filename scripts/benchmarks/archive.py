@@ -22,7 +22,12 @@ SHIFT_PX = 4
 PLANES = ("color", "height", "valid", "source")
 RUNS = {
     "local, 2 workers": ("engine=local", "engine.workers=2"),
-    "local, 1 worker, strips of 512 rows": ("engine=local", "engine.workers=1", "correction.strip_rows=512"),
+    "local, 1 worker, other strips": (
+        "engine=local",
+        "engine.workers=1",
+        "disparity.strip_lines=3000",
+        "correction.strip_rows=256",
+    ),
     "dask, 2 workers": ("engine=dask", "engine.workers=2"),
 }
 

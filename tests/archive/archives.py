@@ -28,7 +28,10 @@ from lsvision.types import Calibration, Motion, Observability, Rig, Travel
 WIDTH = 64
 RIG = Rig(WIDTH, 1120.0, 113.84, 354.0, 8.8, 54.0)
 PROCESSING = Processing(
-    DisparityConfig(strip_lines=32, halo_lines=8), CorrectionConfig(strip_rows=64), False, worker_memory_mb=3072
+    DisparityConfig(block_lines=32, halo_lines=8, strip_lines=32),
+    CorrectionConfig(strip_rows=64),
+    False,
+    worker_memory_mb=3072,
 )
 
 

@@ -106,6 +106,13 @@ def test_strips_of_any_height_make_the_same_products(archive, calibration, undis
     assert_same_products(undisturbed, tmp_path / "o")
 
 
+@pytest.mark.parametrize("lines", [1, 64, 1000])
+def test_disparity_strips_of_any_height_make_the_same_products(archive, calibration, undisturbed, tmp_path, lines):
+    disparity = replace(PROCESSING.disparity, strip_lines=lines)
+    process(archive, calibration, tmp_path / "o", processing=replace(PROCESSING, disparity=disparity))
+    assert_same_products(undisturbed, tmp_path / "o")
+
+
 def test_nothing_is_left_beside_products_ledger_and_depth(undisturbed):
     assert sorted(path.name for path in undisturbed.iterdir()) == [".work", "2024", "a.zarr", "b.zarr", LEDGER_FILE]
     kept = [path.name for scan in (undisturbed / ".work").iterdir() for path in scan.iterdir()]

@@ -24,9 +24,9 @@ from lsvision.stages.disparity import (
 from lsvision.types import Scan, TensorImage, Travel
 from tests.stages.rendered import FULL_RIG, PITCH, SMALL_RIG, simulation, stereo_scan
 
-CONFIG = DisparityConfig(strip_lines=64, halo_lines=16)
+CONFIG = DisparityConfig(block_lines=64, halo_lines=16)
 FINE = DisparityConfig(
-    matcher="coarse_to_fine", refine_iterations=1, largest_sigma_px=0.5, strip_lines=64, halo_lines=32
+    matcher="coarse_to_fine", refine_iterations=1, largest_sigma_px=0.5, block_lines=64, halo_lines=32
 )
 
 
@@ -55,14 +55,24 @@ def test_depth_equals_triangulation_pixel_by_pixel():
 
 
 @pytest.mark.parametrize("config", [CONFIG, FINE])
+@pytest.mark.parametrize("strip_lines", [64, 100, 257, 10_000])
+def test_strips_of_any_height_and_the_whole_are_equal(sheet, config, strip_lines):
+    left, right = sheet[1].left.read(0, sheet[1].lines), sheet[1].right.read(0, sheet[1].lines)
+    untiled = depth_from_disparity(measure_strip(left, right, SMALL_RIG, config).disparity, SMALL_RIG)
+    tiled = MatchedDepth(sheet[1], dataclasses.replace(config, strip_lines=strip_lines))
+    parts = [tiled.read(start, min(start + strip_lines, len(left))) for start in range(0, len(left), strip_lines)]
+    assert torch.cat(parts)[..., 0].numpy().tobytes() == untiled.numpy().tobytes()
+
+
+@pytest.mark.parametrize("config", [CONFIG, FINE])
 def test_values_do_not_depend_on_the_range_read(sheet, config):
     scan = sheet[1]
     whole = MatchedDepth(scan, config).read(0, scan.lines)
     assert whole.shape == (scan.lines, SMALL_RIG.width_px, 1)
-    lazy = MatchedDepth(scan, config, kept_strips=2)
+    lazy = MatchedDepth(scan, config, kept_blocks=2)
     for start, stop in ((0, 5), (60, 70), (100, 200), (63, 64), (scan.lines - 3, scan.lines), (10, 12)):
         torch.testing.assert_close(lazy.read(start, stop), whole[start:stop], rtol=0, atol=0, equal_nan=True)
-        assert len(lazy._strips) <= 2
+        assert len(lazy._blocks) <= 2
 
 
 @pytest.mark.parametrize("config", [CONFIG, dataclasses.replace(FINE, refine_iterations=2)])
@@ -143,7 +153,7 @@ def to_disparity(depth, truth):
 def test_no_refinement_is_the_matcher_alone(sheet):
     scan = sheet[1]
     left, right = scan.left.read(0, 64), scan.right.read(0, 64)
-    config = dataclasses.replace(CONFIG, refine_iterations=0, strip_lines=64, halo_lines=0)
+    config = dataclasses.replace(CONFIG, refine_iterations=0, block_lines=64, halo_lines=0)
     low, high = disparity_range(SMALL_RIG, config)
     expected = match_sgbm(
         left,
