@@ -45,7 +45,7 @@ class DisparityConfig:
     lambda1: float = 8.0
     lambda2: float = 32.0
     left_right_check_px: int = 10
-    fine_check_px: int = 4
+    fine_check_px: int = 2
     uniqueness_percent: int = 5
     speckle_px: int = 100
     refine_iterations: int | None = None

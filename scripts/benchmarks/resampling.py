@@ -152,7 +152,7 @@ def scan_speeds() -> tuple[float, float]:
     scan = Scan(Path("made"), RIG, Travel(PITCH), left, right, None)
     grid = plan_product(scan, MOTION, CONFIG)
     fine = replace(
-        DisparityConfig(), matcher="coarse_to_fine", refine_iterations=1, largest_sigma_px=0.5, halo_lines=48
+        DisparityConfig(), matcher="coarse_to_fine", refine_iterations=1, largest_sigma_px=0.2, halo_lines=48
     )
     maps = [np.ascontiguousarray(values) for values in np.meshgrid(np.arange(7142.0), np.arange(2.0 * STRIP))]
     maps = [values.astype(np.float32) + 0.3 for values in maps]

@@ -39,6 +39,6 @@ def test_no_more_pixels_are_bad_than_with_opencv(motorcycle):
     expected = torch.where(expected >= 0, expected, torch.nan)
     z0 = RIG.zero_disparity_mm
     highest = z0 - RIG.focal_length_px * RIG.baseline_mm / (HIGHEST_PX + 31.086)
-    match = measure_strip(left, right, RIG, DisparityConfig(height_range_mm=(0.0, highest), largest_sigma_px=0.5))
+    match = measure_strip(left, right, RIG, DisparityConfig(height_range_mm=(0.0, highest), largest_sigma_px=0.2))
     assert bad_share(expected, truth) == pytest.approx(0.2148, abs=0.01)
     assert bad_share(match.disparity, truth) <= bad_share(expected, truth)

@@ -26,7 +26,7 @@ from tests.stages.rendered import FULL_RIG, PITCH, SMALL_RIG, simulation, stereo
 
 CONFIG = DisparityConfig(block_lines=64, halo_lines=16)
 FINE = DisparityConfig(
-    matcher="coarse_to_fine", refine_iterations=1, largest_sigma_px=0.5, block_lines=64, halo_lines=32
+    matcher="coarse_to_fine", refine_iterations=1, largest_sigma_px=0.2, block_lines=64, halo_lines=32
 )
 
 

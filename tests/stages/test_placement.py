@@ -90,7 +90,7 @@ def test_with_the_true_depth_nothing_is_out_of_place(kind: str, stretch: float, 
 @pytest.mark.parametrize(("kind", "stretch", "encoder"), [("sheet", 1.07, True), ("rail", 0.93, False)])
 def test_at_full_size_the_matched_depth_puts_pixels_within_a_tenth(kind: str, stretch: float, encoder: bool) -> None:
     scan, true, motion = rendered(kind, 1.0, stretch, 320, encoder, right=True)
-    fine = DisparityConfig(matcher="coarse_to_fine", refine_iterations=1, largest_sigma_px=0.5, halo_lines=48)
+    fine = DisparityConfig(matcher="coarse_to_fine", refine_iterations=1, largest_sigma_px=0.2, halo_lines=48)
     shift, error = misplacement(scan, MatchedDepth(scan, fine), true, motion, 24)
     assert shift.square().mean().sqrt() <= 0.1
     pixel_mm = scan.rig.zero_disparity_mm**2 / (scan.rig.focal_length_px * scan.rig.baseline_mm)
