@@ -118,6 +118,8 @@ def measure_strip(left: Tensor, right: Tensor, rig: Rig, config: DisparityConfig
     pair = TensorImage(left), TensorImage(right)
     white = white_level(*pair)
     blocks = [_measure_block(*pair, rig, config, white, index) for index in range(-(-len(left) // config.block_lines))]
+    if len(blocks) == 1:
+        return blocks[0]
     return StripMatch(torch.cat([block.disparity for block in blocks]), torch.cat([block.sigma for block in blocks]))
 
 
@@ -134,14 +136,15 @@ def _measure_block(
 
 
 def _measure(left: Tensor, right: Tensor, rig: Rig, config: DisparityConfig, white: float) -> StripMatch:
-    disparity = _search(left, right, rig, config, white)
+    left, right = _gray(left, white), _gray(right, white)
+    disparity = _search(left, right, rig, config)
     if not config.refine_iterations:
-        lines, width = left.shape[:2]
+        lines, width = left.shape
         disparity = enlarged(disparity, -(-lines // disparity.shape[0]))[:lines, :width]
         return StripMatch(disparity, torch.full_like(disparity, torch.nan))
     refined = refine_disparity(
-        _gray(left, white),
-        _gray(right, white),
+        left,
+        right,
         disparity,
         window=config.refine_window,
         iterations=config.refine_iterations,
@@ -151,10 +154,10 @@ def _measure(left: Tensor, right: Tensor, rig: Rig, config: DisparityConfig, whi
     return StripMatch(refined.disparity, refined.sigma)
 
 
-def _search(left: Tensor, right: Tensor, rig: Rig, config: DisparityConfig, white: float) -> Tensor:
-    # Every tenth or so pixel tells whether a camera saw anything: in noise alone all would be found to match somewhere.
-    if any(float(_gray(image[::3, ::3], white).float().std()) <= config.refine_noise for image in (left, right)):
-        return torch.full(left.shape[:2], torch.nan)
+def _search(left: Tensor, right: Tensor, rig: Rig, config: DisparityConfig) -> Tensor:
+    # Every tenth or so line tells whether a camera saw anything: in noise alone all would be found to match somewhere.
+    if any(float(image[::9].float().std()) <= config.refine_noise for image in (left, right)):
+        return torch.full(left.shape, torch.nan)
     minimum_px, maximum_px = disparity_range(rig, config)
     options: dict[str, Any] = {
         "minimum_px": minimum_px,
@@ -165,8 +168,9 @@ def _search(left: Tensor, right: Tensor, rig: Rig, config: DisparityConfig, whit
         "left_right_check_px": config.left_right_check_px,
         "uniqueness_percent": config.uniqueness_percent,
         "speckle_px": config.speckle_px,
-        "white": white,
+        "white": 255.0,
     }
+    left, right = left[..., None], right[..., None]
     if config.matcher == "sgbm":
         return match_sgbm(left, right, **options)
     return match_coarse_to_fine(left, right, **options, fine_check_px=config.fine_check_px, noise=config.refine_noise)
