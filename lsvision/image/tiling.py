@@ -1,7 +1,10 @@
 """Work cut into pieces that fit the processor's cache, on as many threads as torch may use."""
 
 import ctypes
+import functools
+import os
 import sys
+import threading
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from typing import TypeVar
@@ -35,11 +38,26 @@ def in_parallel(work: Callable[[Item], Result], items: Iterable[Item]) -> list[R
     threads = torch.get_num_threads()
     if threads == 1:
         return [work(item) for item in items]
-    try:
-        with ThreadPoolExecutor(threads, initializer=torch.set_num_threads, initargs=(1,)) as pool:
-            return list(pool.map(work, items))
-    finally:
-        torch.set_num_threads(threads)  # what the workers set also holds for threads started later
+    return list(_pool(threads, os.getpid()).map(work, items))
+
+
+@functools.cache
+def _pool(threads: int, _process: int) -> ThreadPoolExecutor:
+    """Threads that stay, for starting them takes as long as a dozen tiles; a forked process needs its own."""
+    pool = ThreadPoolExecutor(threads)
+    ready = threading.Barrier(threads + 1)
+
+    def use_one_thread() -> None:
+        torch.set_num_threads(1)
+        torch.get_num_threads()  # from here on the thread keeps its number, whatever others set
+        ready.wait()
+
+    started = [pool.submit(use_one_thread) for _ in range(threads)]
+    ready.wait()
+    for thread in started:
+        thread.result()
+    torch.set_num_threads(threads)  # what the threads have set also holds for those started later
+    return pool
 
 
 def keep_freed_memory() -> None:
