@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Literal
 
 import cv2
@@ -10,13 +11,17 @@ import torch.nn.functional as F  # noqa: N812
 from jaxtyping import Float
 from torch import Tensor
 
+from lsvision.image.tiling import PIXEL_PARTS
+
 Interpolation = Literal["bilinear", "bicubic"]
 Resampler = Literal["grid_sample", "opencv"]
 
-# Positions are rounded to this part of a pixel: float32 holds such a fraction of up to 8192 pixels exactly.
-_PARTS = 2048
+# Rows and columns to sample at once: the window of an image under them, skewed by 3°, stays in the processor's cache.
+SAMPLED_TILE = (128, 256)
+
 _LARGEST_WINDOW = 8192
 _REACH = 2  # pixels that an interpolation looks at beside a position
+_BEYOND = -16.0  # a position outside of any window, where nothing is
 _TAIL = 3.0  # standard deviations at which a Gaussian is cut off
 _CV2_MODES = {"bilinear": cv2.INTER_LINEAR, "bicubic": cv2.INTER_CUBIC}
 
@@ -27,11 +32,13 @@ def sample_image(
     line: Float[Tensor, "rows columns"],
     mode: Interpolation,
     *,
+    first_line: int = 0,
     coarser: tuple[float, float] = (1.0, 1.0),
     resampler: Resampler = "grid_sample",
 ) -> Tensor:
     """Sample one image ``(lines, width, channels)``; see ``sample_images``."""
-    return sample_images((image,), column, line, mode, coarser=coarser, resampler=resampler)[0]
+    images = sample_images((image,), column, line, mode, first_line=first_line, coarser=coarser, resampler=resampler)
+    return images[0]
 
 
 def sample_images(
@@ -40,6 +47,7 @@ def sample_images(
     line: Float[Tensor, "rows columns"],
     mode: Interpolation,
     *,
+    first_line: int = 0,
     coarser: tuple[float, float] = (1.0, 1.0),
     resampler: Resampler = "grid_sample",
 ) -> list[Tensor]:
@@ -49,6 +57,7 @@ def sample_images(
     rim of ``sampling_reach``. Positions outside are clamped to the rim; NaN positions give 0.
 
     Args:
+        first_line: of the images, that ``line`` is counted from.
         coarser: distance of neighbouring samples in lines and in columns; where it exceeds 1, the images are smoothed
             first, so that no detail finer than the samples turns into a false pattern.
 
@@ -58,19 +67,14 @@ def sample_images(
     Raises:
         ValueError: the positions spread over more than 8192 px; sample tile by tile.
     """
-    known = torch.isfinite(column + line)
-    complete = bool(known.all())
-    if not complete:
-        any_known = int(known.flatten().to(torch.uint8).argmax())
-        if not bool(known.flatten()[any_known]):
-            return [image.new_zeros(*column.shape, image.shape[2]) for image in images]
-        column, line = (torch.where(known, at, at.flatten()[any_known]) for at in (column, line))
-    row, lines = _along(line, images[0].shape[0])
-    place, columns = _along(column, images[0].shape[1])
-    windows = [_window(image, lines, columns, coarser) for image in images]
+    along = _Axis.of(line, images[0].shape[0], first_line)
+    across = _Axis.of(column, images[0].shape[1])
+    if along is None or across is None:
+        return [image.new_zeros(*column.shape, image.shape[2]) for image in images]
+    windows = [_window(image, along.window, across.window, coarser) for image in images]
     sample = _remap if resampler == "opencv" else _grid_sample
-    made = [_as_dtype(part, image.dtype) for part, image in zip(sample(windows, place, row, mode), images, strict=True)]
-    return made if complete else [torch.where(known[..., None], part, 0) for part in made]
+    sampled = sample(windows, across.position, along.position, mode)
+    return [_as_dtype(part, image.dtype) for part, image in zip(sampled, images, strict=True)]
 
 
 def sampling_reach(coarser: float) -> int:
@@ -78,14 +82,38 @@ def sampling_reach(coarser: float) -> int:
     return _REACH + _radius(coarser)
 
 
-def _along(position: Tensor, size: int) -> tuple[Tensor, tuple[int, int]]:
-    """Positions on one axis in rounded parts from the start of the window they need, float32; and that window."""
-    position = position.clamp(0, size - 1)
+@dataclass(frozen=True)
+class _Axis:
+    """Positions on one axis of an image, float32, from the start of the window ``(start, stop)`` that they need."""
+
+    position: Tensor
+    window: tuple[int, int]
+
+    @classmethod
+    def of(cls, position: Tensor, size: int, first: int = 0) -> "_Axis | None":
+        """From positions counted from ``first``; what is NaN comes to lie beyond the window. None where all are."""
+        low, high = _ends(position)
+        if low > high:
+            return None
+        if low < -first or high > size - 1 - first:
+            position = position.clamp(-first, size - 1 - first)
+            low, high = _ends(position)
+        start, stop = math.floor(low) - _REACH, math.ceil(high) + _REACH + 1
+        if stop - start > _LARGEST_WINDOW:
+            raise ValueError(f"positions: expected a spread of at most {_LARGEST_WINDOW} px, got {stop - start}")
+        position = position - start  # exact in single precision too: whole pixels are taken off what is larger
+        if position.dtype != torch.float32:
+            position = position.mul_(PIXEL_PARTS).round_().div_(PIXEL_PARTS).to(torch.float32)
+        return cls(position.nan_to_num_(nan=_BEYOND), (first + start, first + stop))
+
+
+def _ends(position: Tensor) -> tuple[float, float]:
+    """Least and greatest of what is not NaN; infinities the wrong way round where everything is."""
     low, high = (float(end) for end in torch.aminmax(position))
-    start, stop = math.floor(low) - _REACH, math.ceil(high) + _REACH + 1
-    if stop - start > _LARGEST_WINDOW:
-        raise ValueError(f"positions: expected a spread of at most {_LARGEST_WINDOW} px, got {stop - start}")
-    return position.sub_(start).mul_(_PARTS).round_().to(torch.float32), (start, stop)
+    if math.isnan(low):
+        low = float(position.nan_to_num(nan=torch.inf).amin())
+        high = float(position.nan_to_num(nan=-torch.inf).amax())
+    return low, high
 
 
 def _as_dtype(sampled: Tensor, dtype: torch.dtype) -> Tensor:
@@ -151,16 +179,18 @@ def _grid_sample(windows: Sequence[Tensor], column: Tensor, line: Tensor, mode: 
     source = column.new_empty(sum(channels), intervals[1] + 1, intervals[0] + 1)
     for part, window in zip(source.split(channels), windows, strict=True):
         part[:, :height, :width] = window.movedim(-1, 0)
-    axes = [at.mul_(2 / (_PARTS * size)).sub_(1) for at, size in zip((column, line), intervals, strict=True)]
-    grid = torch.stack(axes, dim=-1)
-    sampled = F.grid_sample(source[None], grid[None], mode=mode, padding_mode="border", align_corners=True)
+    grid = torch.empty(2, *column.shape)
+    for axis, position, size in zip(grid, (column, line), intervals, strict=True):
+        torch.mul(position, PIXEL_PARTS, out=axis).round_().mul_(2 / (PIXEL_PARTS * size)).sub_(1)
+    sampled = F.grid_sample(
+        source[None], grid.movedim(0, -1)[None], mode=mode, padding_mode="zeros", align_corners=True
+    )
     return sampled[0].movedim(0, -1).split(channels, dim=-1)
 
 
 def _remap(windows: Sequence[Tensor], column: Tensor, line: Tensor, mode: Interpolation) -> Sequence[Tensor]:
-    across, along = (position.div_(_PARTS).numpy() for position in (column, line))
+    across, along = column.numpy(), line.numpy()
     remapped = [
-        cv2.remap(window.numpy(), across, along, _CV2_MODES[mode], borderMode=cv2.BORDER_REPLICATE)
-        for window in windows
+        cv2.remap(window.numpy(), across, along, _CV2_MODES[mode], borderMode=cv2.BORDER_CONSTANT) for window in windows
     ]
     return [torch.from_numpy(image).reshape(*column.shape, -1) for image in remapped]

@@ -14,19 +14,22 @@ import torch
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
-# Windows of an image under tiles of this size, skewed by 3° and stretched by a tenth, still fit 257 x 513 pixels.
-TILE_ROWS, TILE_COLUMNS = 192, 480
+_TILE = (512, 480)  # rows and columns; tall, for what a tile sees lies in more lines than it has rows
+
+# Positions are rounded to this part of a pixel: float32 holds such a fraction of up to 8192 pixels exactly, so that
+# what is sampled there does not depend on the tile it is counted from.
+PIXEL_PARTS = 2048
 
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3  # of glibc's malloc.h
 _KEPT_BYTES = 256 * 2**20
 
 
-def tiles(rows: int, columns: int) -> list[tuple[slice, slice]]:
-    """Row and column ranges of the tiles of a plane."""
+def tiles(rows: int, columns: int, size: tuple[int, int] = _TILE) -> list[tuple[slice, slice]]:
+    """Row and column ranges of the tiles of a plane, each of at most ``size`` rows and columns."""
     return [
-        (slice(row, min(row + TILE_ROWS, rows)), slice(column, min(column + TILE_COLUMNS, columns)))
-        for row in range(0, rows, TILE_ROWS)
-        for column in range(0, columns, TILE_COLUMNS)
+        (slice(row, min(row + size[0], rows)), slice(column, min(column + size[1], columns)))
+        for row in range(0, rows, size[0])
+        for column in range(0, columns, size[1])
     ]
 
 

@@ -50,34 +50,34 @@ class ColorLines:
     shift_mm: Tensor | None = None
     rows: Tensor | None = None
 
-    def sample(self, image: Tensor, line: Tensor, column: Tensor, q_z: Tensor, how: Sampling) -> Tensor:
-        """Colours ``(rows, columns, channels)`` of what green sees at a line and column of the scan and at q_z, mm.
+    def sample(
+        self, image: Tensor, first_line: int, line: Tensor, column: Tensor, height: Tensor, how: Sampling
+    ) -> Tensor:
+        """Colours ``(rows, columns, channels)`` of what green sees at a line and column of the scan and a height, mm.
 
         Args:
-            image: the lines ``image_range`` of the left image.
+            image: the lines ``image_range`` of the left image. line: counted from ``first_line`` of the scan.
         """
-
-        def sampled(image: Tensor, column: Tensor, line: Tensor) -> Tensor:
-            line = line - self.image_range[0]
-            return sample_image(image, column, line, how.interpolation, coarser=self.coarser, resampler=how.resampler)
-
         if self.shift_mm is None or self.rows is None:
-            return sampled(image, column, line)
-        base = (line - self.start).nan_to_num().floor().clamp(0, self.rows.shape[1] - 2).long()
-        part = line - self.start - base
-        colors = [
-            sampled(
-                image[..., [channel]], self._column(column, q_z, shift), torch.lerp(rows[base], rows[base + 1], part)
-            )
-            for channel, (shift, rows) in enumerate(zip(self.shift_mm, self.rows, strict=True))
-        ]
+            return self._sampled(image, column, line, how, first_line - self.image_range[0])
+        begin = first_line - self.start
+        base = line.nan_to_num().floor().clamp(-begin, self.rows.shape[1] - 2 - begin)
+        part, base = (line - base).double(), base.long() + begin
+        colors = []
+        for channel, (shift, rows) in enumerate(zip(self.shift_mm, self.rows - self.image_range[0], strict=True)):
+            row = torch.lerp(rows[base], rows[base + 1], part)
+            colors.append(self._sampled(image[..., [channel]], self._column(column, height, shift), row, how))
         return torch.cat(colors, dim=-1)
 
-    def _column(self, column: Tensor, q_z: Tensor, shift: Tensor) -> Tensor:
+    def _sampled(self, image: Tensor, column: Tensor, line: Tensor, how: Sampling, first_line: int = 0) -> Tensor:
+        mode, resampler = how.interpolation, how.resampler
+        return sample_image(image, column, line, mode, first_line=first_line, coarser=self.coarser, resampler=resampler)
+
+    def _column(self, column: Tensor, height: Tensor, shift: Tensor) -> Tensor:
         """Column at which a colour sees what green sees in another."""
         rig, n, axes = self.rig, self.motion.n, product_axes(self.motion.n)
-        offset = column - rig.principal_left_px
-        z = q_z / (offset / rig.focal_length_px * axes[2, 0] + axes[2, 2])
+        offset = column.double() - rig.principal_left_px
+        z = (rig.zero_disparity_mm - height.double()) / (offset / rig.focal_length_px * axes[2, 0] + axes[2, 2])
         x = offset * z + rig.focal_length_px * shift * n[0] / n[1]
         return rig.principal_left_px + x / (z + shift * n[2] / n[1])
 

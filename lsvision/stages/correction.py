@@ -13,8 +13,9 @@ import torch
 from torch import Tensor
 
 from lsvision.geometry import line_at, product_axes, travel_at
+from lsvision.image.resampling import SAMPLED_TILE
 from lsvision.image.tiling import in_parallel, tiles
-from lsvision.image.visibility import both_ends, interpolate_segments, visible_segments
+from lsvision.image.visibility import Seen, Surface, see_cells
 from lsvision.stages.color_lines import ColorLines, color_lines
 from lsvision.stages.product_grid import CorrectionConfig, ProductGrid, plan_product
 from lsvision.stages.profiles import ProfileReader, ProfileRule
@@ -138,17 +139,6 @@ class _Lines:
         return self.start + first, self.start + last
 
 
-@dataclass(frozen=True)
-class _Seen:
-    """What the cells of a tile see: place in the scan, q_z in mm, and where the depth was measured; float64."""
-
-    line: Tensor
-    column: Tensor
-    q_z: Tensor
-    measured: Tensor
-    sigma: Tensor | None
-
-
 def _correct_rows(correction: _Correction, rows: tuple[int, int]) -> ProductStrip:
     strip = _empty_strip(correction, rows)
     start, stop = _lines_for_rows(correction, rows)
@@ -164,58 +154,83 @@ def _correct_rows(correction: _Correction, rows: tuple[int, int]) -> ProductStri
         seen = _locate(correction, lines, rows[0], *tile)
         if seen is None:
             return
-        strip.color[tile] = lines.colors.sample(image, seen.line, seen.column, seen.q_z, correction.config)
+        color = strip.color[tile]
+        for part in tiles(seen.line.shape[0], seen.line.shape[1], SAMPLED_TILE):
+            at = seen.first_line, seen.line[part], seen.column[part], seen.height[part]
+            color[part] = lines.colors.sample(image, *at, correction.config)
         strip.valid[tile] = seen.measured
-        strip.height[tile] = torch.where(seen.measured, scan.rig.zero_disparity_mm - seen.q_z, torch.nan)
-        strip.source[tile][..., 0], strip.source[tile][..., 1] = seen.line, seen.column
+        strip.height[tile] = seen.height.masked_fill(~seen.measured, torch.nan)
+        strip.source[tile][..., 0], strip.source[tile][..., 1] = seen.line + seen.first_line, seen.column
         if strip.sigma is not None:
-            sigma = position_sigma(
-                scan, motion, seen.line, seen.column, seen.q_z, correction.config.disparity_sigma_px, seen.sigma
-            )
-            strip.sigma[tile] = torch.where(seen.measured[..., None], sigma, torch.nan)
+            line, column = seen.line.double() + seen.first_line, seen.column.double()
+            q_z = scan.rig.zero_disparity_mm - seen.height.double()
+            sigma = position_sigma(scan, motion, line, column, q_z, correction.config.disparity_sigma_px, seen.sigma)
+            strip.sigma[tile] = sigma.masked_fill_(~seen.measured[..., None], torch.nan)
 
     in_parallel(fill, tiles(rows[1] - rows[0], correction.grid.columns))
     return strip
 
 
-def _locate(correction: _Correction, lines: _Lines, row: int, rows: slice, columns: slice) -> _Seen | None:
+@dataclass(frozen=True)
+class _SeenCells:
+    """What the cells of a tile see: place in the scan, counted from ``first_line``, and height, mm."""
+
+    first_line: int
+    line: Tensor
+    column: Tensor
+    height: Tensor
+    measured: Tensor
+    sigma: Tensor | None
+
+
+def _locate(correction: _Correction, lines: _Lines, row: int, rows: slice, columns: slice) -> _SeenCells | None:
     """What the cells of a tile see, along each column of the product; None where no line reaches."""
-    grid, axes = correction.grid, correction.axes
     low, high = correction.offset_range(columns)
     first_row, last_row = row + rows.start, row + rows.stop - 1
-    q_y = [grid.origin_y_mm + grid.pitch_mm * at for at in (first_row, last_row)]
+    q_y = [correction.grid.origin_y_mm + correction.grid.pitch_mm * at for at in (first_row, last_row)]
     start, stop = lines.between(q_y[0] - high, q_y[1] - low)
     if stop - start < 2:
         return None
-    profiles = correction.profiles.read((start, stop), columns)
     along = lines.along[start - lines.start : stop - lines.start]
+    profiles = correction.profiles.read((start, stop), columns)
     backwards = correction.scan.travel.transport == "reverse"
-
-    def by_column(values: Tensor) -> Tensor:
-        return (values.flip(0) if backwards else values).mT.contiguous()  # in the order of growing q_y
-
-    q_z = by_column(profiles.q_z)
-    offset = (correction.q_x(columns)[:, None] * axes[0, 1] + q_z * axes[2, 1]) / axes[1, 1]
-    position = (along.flip(0) if backwards else along) - offset
-    # Whole rows and lines are taken off and put on without rounding: no bit of a row depends on the strip it lies in.
-    position = (position - grid.origin_y_mm) / grid.pitch_mm - first_row
-    missed = _missed_lines(correction, along.flip(0) if backwards else along)
-    connected = q_z.diff(dim=1).abs() <= correction.largest_step_mm  # false beside a hole
-    connected &= missed <= correction.config.bridge_px
-    segment, fraction = visible_segments(position, q_z, connected, rows.stop - rows.start)
-
-    def seen(values: Tensor) -> Tensor:
-        return interpolate_segments(values, segment, fraction).mT.contiguous()
-
-    measured = both_ends(by_column(profiles.measured), segment) & (missed <= _MISSED_LINES)[segment.clamp(min=0)]
-    line = ((stop - 1) - segment) - fraction if backwards else (start + segment) + fraction
-    return _Seen(
-        line=line.mT.contiguous(),
-        column=seen(by_column(profiles.column)),
-        q_z=seen(q_z),
-        measured=measured.mT.contiguous(),
-        sigma=None if profiles.sigma is None else seen(by_column(profiles.sigma)),
+    if backwards:  # in the order of growing q_y
+        along, profiles = along.flip(0), Seen.of([values.flip(0) for values in profiles.tensors()])
+    seen = see_cells(_surface(correction, along, profiles, first_row, columns), rows.stop - rows.start, dim=0)
+    return _SeenCells(
+        first_line=start,
+        line=(stop - 1 - start) - seen.place if backwards else seen.place,
+        column=seen.carried[0],
+        height=seen.height,
+        measured=seen.measured,
+        sigma=seen.carried[1] if profiles.carried else None,
     )
+
+
+def _surface(correction: _Correction, along: Tensor, profiles: Seen, row: int, columns: slice) -> Surface:
+    """Profiles, ``along`` of which is where their lines lie, mm, as a surface over the rows from ``row`` on."""
+    grid, axes = correction.grid, correction.axes
+    # By Y = q_x axes[0, 1] + q_y axes[1, 1] + q_z axes[2, 1], with q_z = zero disparity - height.
+    across = correction.q_x(slice(0, grid.columns)) * (axes[0, 1] / axes[1, 1])
+    across = across + correction.scan.rig.zero_disparity_mm * (axes[2, 1] / axes[1, 1])
+    base = _snapped((along - across[0] - grid.origin_y_mm) / grid.pitch_mm)
+    shift = _snapped((across[0] - across[columns]) / grid.pitch_mm).float()
+    part = torch.add((base - base.floor()).float()[:, None], shift)
+    missed = _missed_lines(correction, along)[:, None]
+    return Surface(
+        whole=(base.floor() - row).float(),
+        part=part.add_(profiles.height, alpha=float(axes[2, 1] / (axes[1, 1] * grid.pitch_mm))),
+        height=profiles.height,
+        carried=(profiles.place, *profiles.carried),
+        connected=(profiles.height.diff(dim=0).abs_() <= correction.largest_step_mm)  # false beside a hole
+        .logical_and_(missed <= correction.config.bridge_px),
+        measured=(profiles.measured[1:] & profiles.measured[:-1]).logical_and_(missed <= _MISSED_LINES),
+    )
+
+
+def _snapped(cells: Tensor) -> Tensor:
+    """Positions to a millionth of a cell, so that lines of equal travel stay at one place."""
+    return (cells * 2**20).round() / 2**20
 
 
 def _missed_lines(correction: _Correction, along: Tensor) -> Tensor:

@@ -3,7 +3,6 @@
 q_x and q_z of a sample depend on its own line alone, so this needs no travel, and every line stands for itself.
 """
 
-from collections import OrderedDict
 from dataclasses import dataclass, field
 
 import torch
@@ -11,10 +10,10 @@ from torch import Tensor
 
 from lsvision.geometry import product_axes
 from lsvision.image.tiling import in_parallel
-from lsvision.image.visibility import both_ends, bridge_gaps, interpolate_segments, visible_segments
+from lsvision.image.visibility import Seen, Surface, bridge_gaps, see_cells
 from lsvision.types import LineImage, Motion, Rig
 
-_BLOCK_LINES = 16  # few enough that all of a block's intermediate values stay in the processor's cache
+_BLOCK_LINES = 64
 
 
 @dataclass(frozen=True)
@@ -32,39 +31,37 @@ class ProfileRule:
     bridge_px: int
 
 
-@dataclass(frozen=True)
-class Profiles:
-    """Lines seen at the columns of a product, each ``(lines, columns)``.
+def resolve_profiles(z: Tensor, sigma: Tensor | None, rig: Rig, motion: Motion, rule: ProfileRule) -> Seen:
+    """Lines seen at the columns of a product, from their depth ``z (lines, width)``, float32 mm, NaN for none.
 
-    ``column`` of the left image, px, and ``q_z``, mm, are float64 and NaN where nothing is seen; ``measured`` is false
-    where the depth was bridged; ``sigma`` is the standard deviation of the depth, mm, where the scan has it.
+    Returns:
+        ``place`` is the column of the left image, px; ``height`` is over the plane of zero disparity, mm; what was
+        bridged is not ``measured``; ``carried`` holds the standard deviation of the depth, mm, where it is given.
     """
-
-    column: Tensor
-    q_z: Tensor
-    measured: Tensor
-    sigma: Tensor | None
-
-
-def resolve_profiles(z: Tensor, sigma: Tensor | None, rig: Rig, motion: Motion, rule: ProfileRule) -> Profiles:
-    """Profiles of lines from their depth ``z (lines, width)``, mm, NaN for none."""
     axes = product_axes(motion.n)
-    z = z.to(torch.float64)
-    measured = (z >= rule.z_range_mm[0]) & (z <= rule.z_range_mm[1])
+    # Counted from the middle of the range, single precision holds a depth to a hundred-thousandth of a millimetre.
+    middle, half = sum(rule.z_range_mm) / 2, (rule.z_range_mm[1] - rule.z_range_mm[0]) / 2
+    beyond = z - middle
+    measured = beyond.abs() <= half
     if not bool(measured.all()):
-        z = bridge_gaps(torch.where(measured, z, torch.nan), longest=rule.bridge_px, largest_step=rule.largest_step_mm)
+        beyond = beyond.masked_fill_(~measured, torch.nan)
+        beyond = bridge_gaps(beyond, longest=rule.bridge_px, largest_step=rule.largest_step_mm)
     slope = (torch.arange(z.shape[1], dtype=torch.float64) - rig.principal_left_px) / rig.focal_length_px
     # (x, z) = (slope, 1) z, so that q_x and q_z are multiples of z too.
-    position = z * ((slope * axes[0, 0] + axes[0, 2]) / rule.pitch_mm) - rule.origin_x_mm / rule.pitch_mm
-    q_z = z * (slope * axes[2, 0] + axes[2, 2])
-    connected = z.diff(dim=1).abs() <= rule.largest_step_mm  # false beside a hole
-    segment, fraction = visible_segments(position, q_z, connected, rule.columns)
-    return Profiles(
-        column=segment + fraction,
-        q_z=interpolate_segments(q_z, segment, fraction),
-        measured=both_ends(measured, segment),
-        sigma=None if sigma is None else interpolate_segments(sigma, segment, fraction),
+    cells_per_mm = (slope * axes[0, 0] + axes[0, 2]) / rule.pitch_mm
+    q_z_per_mm = slope * axes[2, 0] + axes[2, 2]
+    base = middle * cells_per_mm - rule.origin_x_mm / rule.pitch_mm
+    surface = Surface(
+        whole=base.floor().to(z.dtype),
+        part=torch.addcmul((base - base.floor()).to(z.dtype), beyond, cells_per_mm.to(z.dtype)),
+        height=torch.addcmul(
+            (rig.zero_disparity_mm - middle * q_z_per_mm).to(z.dtype), beyond, -q_z_per_mm.to(z.dtype)
+        ),
+        carried=() if sigma is None else (sigma,),
+        connected=beyond.diff(dim=1).abs_() <= rule.largest_step_mm,  # false beside a hole
+        measured=measured[:, 1:] & measured[:, :-1],
     )
+    return see_cells(surface, rule.columns, dim=1)
 
 
 @dataclass
@@ -80,7 +77,7 @@ class ProfileReader:
     rig: Rig
     motion: Motion
     rule: ProfileRule
-    _blocks: OrderedDict[int, Profiles] = field(default_factory=OrderedDict, init=False, repr=False)
+    _blocks: dict[int, Seen] = field(default_factory=dict, init=False, repr=False)
 
     def load(self, start: int, stop: int) -> None:
         """Resolve the lines ``start..stop-1`` and forget those outside."""
@@ -95,20 +92,18 @@ class ProfileReader:
         z = self.depth.read(first, last)[..., 0]
         sigma = None if self.sigma is None else self.sigma.read(first, last)[..., 0]
 
-        def resolved(index: int) -> Profiles:
+        def resolved(index: int) -> Seen:
             lines = slice(index * _BLOCK_LINES - first, (index + 1) * _BLOCK_LINES - first)
             return resolve_profiles(z[lines], None if sigma is None else sigma[lines], self.rig, self.motion, self.rule)
 
         self._blocks.update(zip(missing, in_parallel(resolved, missing), strict=True))
 
-    def read(self, lines: tuple[int, int], columns: slice) -> Profiles:
+    def read(self, lines: tuple[int, int], columns: slice) -> Seen:
         """Profiles of loaded lines ``lines[0]..lines[1]-1`` at a range of columns."""
         start, stop = lines
         blocks = range(start // _BLOCK_LINES, -(-stop // _BLOCK_LINES))
-        inside = slice(start - blocks[0] * _BLOCK_LINES, stop - blocks[0] * _BLOCK_LINES)
-
-        def joined(name: str) -> Tensor:
-            return torch.cat([getattr(self._blocks[index], name)[:, columns] for index in blocks])[inside]
-
-        sigma = None if self.sigma is None else joined("sigma")
-        return Profiles(joined("column"), joined("q_z"), joined("measured"), sigma)
+        parts: list[list[Tensor]] = []
+        for index in blocks:
+            inside = slice(max(start - index * _BLOCK_LINES, 0), stop - index * _BLOCK_LINES)
+            parts.append([values[inside, columns] for values in self._blocks[index].tensors()])
+        return Seen.of([torch.cat(values) for values in zip(*parts, strict=True)])

@@ -6,9 +6,28 @@ import math
 import pytest
 import torch
 
-from lsvision.image.visibility import both_ends, bridge_gaps, interpolate_segments, visible_segments
+from lsvision.image.visibility import Seen, Surface, bridge_gaps, see_cells
 
 CELLS = 12
+
+
+HALF_PART = 0.5 / 2048 + 1e-9
+
+
+def see(position, depth, connected, cells, *, carried=(), measured=None, dim=1) -> Seen:
+    """What cells see of lines given along the last axis, whichever axis they are handed over along."""
+    samples = position.shape[1]
+    whole = torch.arange(samples).to(position.dtype) - 3  # any whole numbers will do
+
+    def laid(values):
+        return values.mT.contiguous() if dim == 0 else values
+
+    measured = connected if measured is None else measured
+    surface = Surface(
+        whole, laid(position - whole), laid(-depth), [laid(each) for each in carried], laid(connected), laid(measured)
+    )
+    seen = see_cells(surface, cells, dim)
+    return Seen.of([values.mT if dim == 0 else values for values in seen.tensors()])
 
 
 def naive(position, depth, connected, cells):
@@ -48,23 +67,53 @@ def random_lines(kind: str):
     return position, depth, connected
 
 
+@pytest.mark.parametrize("dim", [0, 1])
 @pytest.mark.parametrize("kind", ["monotone", "folded", "stepped", "holed", "stretched"])
-def test_equals_the_naive_search(kind):
+def test_equals_the_naive_search(kind, dim):
     position, depth, connected = random_lines(kind)
-    segment, fraction = visible_segments(position, depth, connected, CELLS)
-    expected, part = naive(position, depth, connected, CELLS)
-    assert torch.equal(segment, expected)
-    torch.testing.assert_close(fraction, part, rtol=0, atol=1e-12, equal_nan=True)
+    other = torch.rand(position.shape).double()
+    seen = see(position, depth, connected, CELLS, carried=(other,), dim=dim)
+    segment, fraction = naive(position, depth, connected, CELLS)
+    exact = {"rtol": 0, "atol": 1e-12, "equal_nan": True}
+    begin, end = segment.clamp(min=0), segment.clamp(min=0) + 1
+    nothing = torch.where(segment < 0, torch.nan, 0.0).double()
+    torch.testing.assert_close(seen.place, segment + fraction + nothing, rtol=0, atol=HALF_PART, equal_nan=True)
+    for values, found in ((-depth, seen.height), (other, seen.carried[0])):
+        torch.testing.assert_close(found, torch.lerp(values.gather(1, begin), values.gather(1, end), fraction), **exact)
+    assert torch.equal(seen.measured, segment >= 0)
     assert (segment >= 0).any()
 
 
-def test_batch_equals_loop():
+@pytest.mark.parametrize("dim", [0, 1])
+def test_batch_equals_loop(dim):
     position, depth, connected = random_lines("folded")
-    segment, fraction = visible_segments(position, depth, connected, CELLS)
+    seen = see(position, depth, connected, CELLS, dim=dim)
     for i in range(len(position)):
-        alone = visible_segments(position[i : i + 1], depth[i : i + 1], connected[i : i + 1], CELLS)
-        assert torch.equal(alone[0][0], segment[i])
-        assert torch.equal(alone[1][0].nan_to_num(nan=-1.0), fraction[i].nan_to_num(nan=-1.0))
+        alone = see(position[i : i + 1], depth[i : i + 1], connected[i : i + 1], CELLS, dim=dim)
+        for one, all_of_them in zip(alone.tensors(), seen.tensors(), strict=True):
+            assert torch.equal(one[0].nan_to_num(nan=-1.0), all_of_them[i].nan_to_num(nan=-1.0))
+
+
+def test_whole_cells_come_off_without_rounding():
+    position, depth, connected = (values[:, :20] for values in random_lines("folded"))
+    connected = connected[:, :19]
+    whole, part = position.floor(), (position - position.floor()).float()
+    surfaces = [
+        Surface(whole[0].float() + shift, part[:1], -depth[:1].float(), (), connected[:1], connected[:1])
+        for shift in (0.0, 5000.0)
+    ]
+    here, there = see_cells(surfaces[0], 12, 1), see_cells(surfaces[1], 5012, 1)
+    for near, far in zip(here.tensors(), there.tensors(), strict=True):
+        assert torch.equal(near.nan_to_num(nan=-1.0), far[:, 5000:].nan_to_num(nan=-1.0))
+
+
+def test_a_segment_that_rounding_makes_cover_a_cell_shows_its_end():
+    # Twice the same place; in single precision 1 + 1e-9 is 1, and only the second lies before cell 1.
+    whole, part = torch.tensor([0.0, 1.0, 2.0]), torch.tensor([[1.0, 1e-9, 0.5]])
+    height, connected = torch.tensor([[3.0, 3.0, 4.0]]), torch.ones(1, 2, dtype=torch.bool)
+    seen = see_cells(Surface(whole, part, height, (), connected, connected), 3, 1)
+    assert seen.place[0, 1:].tolist() == [0.0, pytest.approx(1 + 2 / 3, abs=HALF_PART)]
+    assert seen.height[0, 1] == 3.0
 
 
 def test_step_by_hand():
@@ -72,34 +121,35 @@ def test_step_by_hand():
     position = torch.tensor([[-0.5, 1.5, 3.5, 4.5, 2.5, 4.75, 7.0]]).double()
     depth = torch.tensor([[9.0, 9.0, 9.0, 9.0, 5.0, 5.0, 5.0]]).double()
     connected = torch.tensor([[True, True, True, False, True, True]])
-    segment, fraction = visible_segments(position, depth, connected, 8)
-    assert segment.tolist() == [[0, 0, 1, 4, 4, 5, 5, -1]]
-    expected = torch.tensor([[0.25, 0.75, 0.25, 2 / 9, 2 / 3, 1 / 9, 5 / 9, torch.nan]], dtype=torch.float64)
-    torch.testing.assert_close(fraction, expected, rtol=0, atol=1e-12, equal_nan=True)
+    measured = torch.tensor([[True, False, True, True, True, True]])
+    seen = see(position, depth, connected, 8, measured=measured)
+    expected = torch.tensor([[0.25, 0.75, 1.25, 4 + 2 / 9, 4 + 2 / 3, 5 + 1 / 9, 5 + 5 / 9, torch.nan]])
+    torch.testing.assert_close(seen.place, expected.double(), rtol=0, atol=HALF_PART, equal_nan=True)
+    assert seen.height[0, :7].tolist() == [-9.0, -9.0, -9.0, -5.0, -5.0, -5.0, -5.0]
+    assert seen.measured.tolist() == [[True, True, False, True, True, True, True, False]]
 
 
 def test_a_disconnected_step_is_not_filled():
     position = torch.tensor([[0.0, 1.0, 6.0, 7.0]]).double()
     connected = torch.tensor([[True, False, True]])
-    segment, _ = visible_segments(position, torch.zeros(1, 4).double(), connected, 8)
-    assert segment.tolist() == [[0, -1, -1, -1, -1, -1, 2, -1]]
+    seen = see(position, torch.zeros(1, 4).double(), connected, 8)
+    assert seen.place.isfinite().tolist() == [[True, False, False, False, False, False, True, False]]
 
 
 def test_nothing_to_see():
     for position in (torch.full((2, 4), torch.nan), torch.tensor([[3.0, 2.0, 1.0, 0.0]] * 2), torch.rand(2, 4) - 9):
-        segment, fraction = visible_segments(position, position, torch.ones(2, 3, dtype=torch.bool), 5)
-        assert (segment == -1).all()
-        assert fraction.isnan().all()
+        seen = see(position, position, torch.ones(2, 3, dtype=torch.bool), 5)
+        assert seen.place.isnan().all()
+        assert seen.height.isnan().all()
+        assert not seen.measured.any()
 
 
-def test_interpolation_and_flags_of_segments():
-    values = torch.tensor([[1.0, 3.0, torch.nan, 8.0]]).double()
-    segment = torch.tensor([[0, 1, 2, -1, 0]])
-    fraction = torch.tensor([[0.25, 0.5, 0.5, torch.nan, 1.0]]).double()
-    blended = interpolate_segments(values, segment, fraction)
-    assert blended.isnan().tolist() == [[False, True, True, True, False]]
-    assert blended[0, [0, 4]].tolist() == [1.5, 3.0]
-    assert both_ends(values.isfinite(), segment).tolist() == [[True, False, False, False, True]]
+@pytest.mark.parametrize("dim", [0, 1])
+def test_a_segment_over_many_cells_is_cut_to_them(dim):
+    position = torch.tensor([[-4.0, 20.0]]).double()
+    connected = torch.ones(1, 1, dtype=torch.bool)
+    seen = see(position, torch.tensor([[0.0, 24.0]]).double(), connected, 8, dim=dim)
+    assert torch.equal(seen.height, -torch.arange(4.0, 12.0).double()[None])
 
 
 def naive_bridge(values, longest, largest_step):
