@@ -1,6 +1,6 @@
 """Line cameras, triangulation, motion and rigid transforms: batched, differentiable, float64."""
 
-from lsvision.geometry.camera import project, triangulate, triangulate_general, triangulation_jacobian
+from lsvision.geometry.camera import depth_at, project, triangulate, triangulate_general, triangulation_jacobian
 from lsvision.geometry.motion import (
     displace,
     from_product,
@@ -20,6 +20,7 @@ from lsvision.geometry.rigid import (
 )
 
 __all__ = [
+    "depth_at",
     "displace",
     "euler_angles",
     "fit_rigid",

@@ -25,11 +25,15 @@ def triangulate(
 
     Source: Wang et al. 2024, Eq. 2, with the offset of shifted sensors.
     """
-    convergence = disparity_px + (rig.principal_right_px - rig.principal_left_px)
-    convergence = torch.where(convergence > 0, convergence, torch.nan)
-    z = rig.focal_length_px * rig.baseline_mm / convergence
+    z = depth_at(rig, disparity_px)
     x = (left_px - rig.principal_left_px) * z / rig.focal_length_px
     return x, z
+
+
+def depth_at(rig: Rig, disparity_px: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+    """z of what has a disparity, mm, as in ``triangulate``; NaN where the rays do not meet in front of the cameras."""
+    convergence = disparity_px + (rig.principal_right_px - rig.principal_left_px)
+    return (rig.focal_length_px * rig.baseline_mm) / torch.where(convergence > 0, convergence, torch.nan)
 
 
 def project(

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from lsvision.errors import ConfigError
-from lsvision.geometry import triangulate
+from lsvision.geometry import depth_at
 from lsvision.image.agreement import occluded
 from lsvision.image.brightness import gray, gray_bytes, white_level
 from lsvision.image.matching import match_sgbm
@@ -181,12 +181,6 @@ def _gray(image: Tensor, white: float) -> Tensor:
     return gray_bytes(image) if image.dtype == torch.uint8 else gray(image) * (255.0 / white)
 
 
-def depth_from_disparity(disparity: Tensor, rig: Rig) -> Tensor:
-    """Depth z, mm, of a disparity strip ``(lines, width)``, in the strip's dtype; NaN stays NaN."""
-    column = torch.arange(disparity.shape[-1], dtype=torch.float64).expand(disparity.shape)
-    return triangulate(rig, column, disparity.to(torch.float64))[1].to(disparity.dtype)
-
-
 def depth_sigma(depth: Tensor, sigma: Tensor, rig: Rig) -> Tensor:
     """Standard deviation of depths, mm, from that of their disparities, px: ``dz/dd = -z² / (f B)``."""
     return depth.square() * (sigma / (rig.focal_length_px * rig.baseline_mm))
@@ -202,7 +196,7 @@ class MatchedDepth:
     scan: Scan
     config: DisparityConfig = field(default_factory=DisparityConfig)
     kept_blocks: int = 3
-    _blocks: OrderedDict[int, Tensor] = field(default_factory=OrderedDict, init=False, repr=False)
+    _blocks: OrderedDict[int, tuple[Tensor, Tensor]] = field(default_factory=OrderedDict, init=False, repr=False)
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -216,19 +210,20 @@ class MatchedDepth:
 
     def read(self, start: int, stop: int) -> Tensor:
         """Depth of lines ``start..stop-1``, ``(stop - start, width, 1)`` in mm."""
-        return self._read(start, stop)[0, :, :, None]
+        return self._read(start, stop, 0)
 
     def read_sigma(self, start: int, stop: int) -> Tensor:
         """Standard deviation of the depth of lines ``start..stop-1``, ``(stop - start, width, 1)`` in mm."""
-        return self._read(start, stop)[1, :, :, None]
+        return self._read(start, stop, 1)
 
-    def _read(self, start: int, stop: int) -> Tensor:
+    def _read(self, start: int, stop: int, which: Literal[0, 1]) -> Tensor:
         size = self.config.block_lines
         first, last = start // size, (stop - 1) // size
-        blocks = torch.cat([self._block(index) for index in range(first, last + 1)], dim=1)
-        return blocks[:, start - first * size : stop - first * size]
+        blocks = [self._block(index)[which] for index in range(first, last + 1)]
+        lines = slice(start - first * size, stop - first * size)
+        return (blocks[0] if len(blocks) == 1 else torch.cat(blocks))[lines, :, None]
 
-    def _block(self, index: int) -> Tensor:
+    def _block(self, index: int) -> tuple[Tensor, Tensor]:
         if index not in self._blocks:
             self._blocks[index] = self._match(index)
             while len(self._blocks) > self.kept_blocks:
@@ -241,12 +236,12 @@ class MatchedDepth:
         assert self.scan.right is not None
         return white_level(self.scan.left, self.scan.right)
 
-    def _match(self, index: int) -> Tensor:
-        """Depth and its standard deviation, (2, lines, width)."""
+    def _match(self, index: int) -> tuple[Tensor, Tensor]:
+        """Depth and its standard deviation, each (lines, width)."""
         assert self.scan.right is not None
         match = _measure_block(self.scan.left, self.scan.right, self.scan.rig, self.config, self._white, index)
-        depth = depth_from_disparity(match.disparity, self.scan.rig)
-        return torch.stack([depth, depth_sigma(depth, match.sigma, self.scan.rig)])
+        depth = depth_at(self.scan.rig, match.disparity)
+        return depth, depth_sigma(depth, match.sigma, self.scan.rig)
 
 
 def depth_of(scan: Scan, config: DisparityConfig) -> LineImage:

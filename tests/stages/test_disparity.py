@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from lsvision.geometry import triangulate, triangulation_jacobian
+from lsvision.geometry import depth_at, triangulate, triangulation_jacobian
 from lsvision.image.brightness import gray
 from lsvision.image.matching import match_sgbm
 from lsvision.simulation import SceneConfig
@@ -15,7 +15,6 @@ from lsvision.stages.disparity import (
     DisparityConfig,
     MatchedDepth,
     StripMatch,
-    depth_from_disparity,
     depth_of,
     depth_sigma,
     disparity_range,
@@ -46,7 +45,7 @@ def test_default_range_is_that_of_the_camera():
 
 def test_depth_equals_triangulation_pixel_by_pixel():
     disparity = torch.tensor([[0.0, 3.5, torch.nan, -7.25]])
-    depth = depth_from_disparity(disparity, SMALL_RIG)
+    depth = depth_at(SMALL_RIG, disparity)
     assert depth.dtype == torch.float32
     assert depth[0, 0] == pytest.approx(SMALL_RIG.zero_disparity_mm)
     for column, value in enumerate(disparity[0].double()):
@@ -58,7 +57,7 @@ def test_depth_equals_triangulation_pixel_by_pixel():
 @pytest.mark.parametrize("strip_lines", [64, 100, 257, 10_000])
 def test_strips_of_any_height_and_the_whole_are_equal(sheet, config, strip_lines):
     left, right = sheet[1].left.read(0, sheet[1].lines), sheet[1].right.read(0, sheet[1].lines)
-    untiled = depth_from_disparity(measure_strip(left, right, SMALL_RIG, config).disparity, SMALL_RIG)
+    untiled = depth_at(SMALL_RIG, measure_strip(left, right, SMALL_RIG, config).disparity)
     tiled = MatchedDepth(sheet[1], dataclasses.replace(config, strip_lines=strip_lines))
     parts = [tiled.read(start, min(start + strip_lines, len(left))) for start in range(0, len(left), strip_lines)]
     assert torch.cat(parts)[..., 0].numpy().tobytes() == untiled.numpy().tobytes()
@@ -168,7 +167,7 @@ def test_no_refinement_is_the_matcher_alone(sheet):
         speckle_px=100,
     )
     depth = MatchedDepth(scan, config).read(0, 64)[..., 0]
-    torch.testing.assert_close(depth, depth_from_disparity(expected, SMALL_RIG), equal_nan=True)
+    torch.testing.assert_close(depth, depth_at(SMALL_RIG, expected), equal_nan=True)
 
 
 def test_own_depth_comes_first():
