@@ -12,7 +12,7 @@ from torch import Tensor
 from lsvision.image.tiling import in_parallel
 
 # Worked on at once: the dozen intermediate images of a tile then stay in the processor's cache.
-_TILE_LINES, _TILE_COLUMNS = 128, 512
+_TILE_LINES, _TILE_COLUMNS = 256, 512
 _SAME_SURFACE_PX = 0.5  # from a window's mean
 _ROUNDING = 1.0 / 6.0  # variance of the difference of two whole grey values
 # Variance of half the difference of two neighbours over that of the residual: half a pixel's noise, over one pixel's

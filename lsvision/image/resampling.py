@@ -17,7 +17,7 @@ Interpolation = Literal["bilinear", "bicubic"]
 Resampler = Literal["grid_sample", "opencv"]
 
 # Rows and columns to sample at once: the window of an image under them, skewed by 3°, stays in the processor's cache.
-SAMPLED_TILE = (128, 256)
+SAMPLED_TILE = (128, 480)
 
 _LARGEST_WINDOW = 8192
 _REACH = 2  # pixels that an interpolation looks at beside a position

@@ -20,7 +20,7 @@ _TILE = (512, 480)  # rows and columns; tall, for what a tile sees lies in more 
 # what is sampled there does not depend on the tile it is counted from.
 PIXEL_PARTS = 2048
 
-_M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3  # of glibc's malloc.h
+_M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD, _M_ARENA_MAX = -1, -3, -8  # of glibc's malloc.h
 _KEPT_BYTES = 256 * 2**20
 
 
@@ -74,3 +74,4 @@ def keep_freed_memory() -> None:
         if mallopt is not None:
             mallopt(_M_MMAP_THRESHOLD, _KEPT_BYTES // 8)
             mallopt(_M_TRIM_THRESHOLD, _KEPT_BYTES)
+            mallopt(_M_ARENA_MAX, 1)
