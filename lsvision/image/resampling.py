@@ -3,7 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import cv2
 import torch
@@ -16,10 +16,12 @@ from lsvision.image.tiling import PIXEL_PARTS
 Interpolation = Literal["bilinear", "bicubic"]
 Resampler = Literal["grid_sample", "opencv"]
 
-# Rows and columns to sample at once: the window of an image under them, skewed by 3°, stays in the processor's cache.
-SAMPLED_TILE = (128, 480)
+# Rows and columns to sample at once: under grid_sample's, skewed by 3°, an image stays in the processor's cache; OpenCV
+# sees to that itself.
+SAMPLED_TILES: dict[Resampler, tuple[int, int]] = {"grid_sample": (128, 480), "opencv": (512, 480)}
 
 _LARGEST_WINDOW = 8192
+_LARGEST_REMAPPED = 32766  # what OpenCV counts pixels up to
 _REACH = 2  # pixels that an interpolation looks at beside a position
 _BEYOND = -16.0  # a position outside of any window, where nothing is
 _TAIL = 3.0  # standard deviations at which a Gaussian is cut off
@@ -35,10 +37,11 @@ def sample_image(
     first_line: int = 0,
     coarser: tuple[float, float] = (1.0, 1.0),
     resampler: Resampler = "grid_sample",
+    out: Tensor | None = None,
 ) -> Tensor:
     """Sample one image ``(lines, width, channels)``; see ``sample_images``."""
-    images = sample_images((image,), column, line, mode, first_line=first_line, coarser=coarser, resampler=resampler)
-    return images[0]
+    options: dict[str, Any] = {"first_line": first_line, "coarser": coarser, "resampler": resampler}
+    return sample_images((image,), column, line, mode, **options, out=None if out is None else (out,))[0]
 
 
 def sample_images(
@@ -50,7 +53,8 @@ def sample_images(
     first_line: int = 0,
     coarser: tuple[float, float] = (1.0, 1.0),
     resampler: Resampler = "grid_sample",
-) -> list[Tensor]:
+    out: Sequence[Tensor] | None = None,
+) -> Sequence[Tensor]:
     """Sample images ``(lines, width, channels)`` of one size at positions in px, all of them in one call.
 
     Positions are rounded to 1/2048 px: cut from a larger image, at any place, an image gives the same bits, up to the
@@ -60,6 +64,7 @@ def sample_images(
         first_line: of the images, that ``line`` is counted from.
         coarser: distance of neighbouring samples in lines and in columns; where it exceeds 1, the images are smoothed
             first, so that no detail finer than the samples turns into a false pattern.
+        out: where the samples are put; made where it is None. Rows may lie apart.
 
     Returns:
         ``(rows, columns, channels)`` of each image, in its dtype.
@@ -67,14 +72,18 @@ def sample_images(
     Raises:
         ValueError: the positions spread over more than 8192 px; sample tile by tile.
     """
-    along = _Axis.of(line, images[0].shape[0], first_line)
-    across = _Axis.of(column, images[0].shape[1])
+    if out is None:
+        out = [image.new_empty(*column.shape, image.shape[2]) for image in images]
+    (height, width, _), opencv = images[0].shape, resampler == "opencv"
+    whole = opencv and coarser == (1.0, 1.0) and max(height, width) <= _LARGEST_REMAPPED
+    along, across = _Axis.of(line, height, first_line, whole=whole), _Axis.of(column, width, whole=whole)
     if along is None or across is None:
-        return [image.new_zeros(*column.shape, image.shape[2]) for image in images]
+        for into in out:
+            into.zero_()
+        return out
     windows = [_window(image, along.window, across.window, coarser) for image in images]
-    sample = _remap if resampler == "opencv" else _grid_sample
-    sampled = sample(windows, across.position, along.position, mode)
-    return [_as_dtype(part, image.dtype) for part, image in zip(sampled, images, strict=True)]
+    (_remap if opencv else _grid_sample)(windows, across.position, along.position, mode, out)
+    return out
 
 
 def sampling_reach(coarser: float) -> int:
@@ -90,36 +99,43 @@ class _Axis:
     window: tuple[int, int]
 
     @classmethod
-    def of(cls, position: Tensor, size: int, first: int = 0) -> "_Axis | None":
-        """From positions counted from ``first``; what is NaN comes to lie beyond the window. None where all are."""
-        low, high = _ends(position)
+    def of(cls, position: Tensor, size: int, first: int = 0, *, whole: bool = False) -> "_Axis | None":
+        """From positions counted from ``first``; what is NaN comes to lie beyond the window. None where all are.
+
+        With ``whole`` the window is all of the image where that holds enough.
+        """
+        low, high, gaps = _ends(position)
         if low > high:
             return None
         if low < -first or high > size - 1 - first:
             position = position.clamp(-first, size - 1 - first)
-            low, high = _ends(position)
+            low, high, gaps = _ends(position)
         start, stop = math.floor(low) - _REACH, math.ceil(high) + _REACH + 1
         if stop - start > _LARGEST_WINDOW:
             raise ValueError(f"positions: expected a spread of at most {_LARGEST_WINDOW} px, got {stop - start}")
-        position = position - start  # exact in single precision too: whole pixels are taken off what is larger
+        if whole and position.dtype == torch.float32 and start >= -first and stop <= size - first:
+            start, stop = -first, size - first
+        if start != 0:
+            position = position - start  # exact in single precision too: whole pixels are taken off what is larger
         if position.dtype != torch.float32:
-            position = position.mul_(PIXEL_PARTS).round_().div_(PIXEL_PARTS).to(torch.float32)
-        return cls(position.nan_to_num_(nan=_BEYOND), (first + start, first + stop))
+            position = (position * PIXEL_PARTS).round_().div_(PIXEL_PARTS).to(torch.float32)
+        return cls(position.nan_to_num(nan=_BEYOND) if gaps else position, (first + start, first + stop))
 
 
-def _ends(position: Tensor) -> tuple[float, float]:
-    """Least and greatest of what is not NaN; infinities the wrong way round where everything is."""
+def _ends(position: Tensor) -> tuple[float, float, bool]:
+    """Least and greatest of what is not NaN, infinities the wrong way round where all are; and whether any is."""
     low, high = (float(end) for end in torch.aminmax(position))
-    if math.isnan(low):
-        low = float(position.nan_to_num(nan=torch.inf).amin())
-        high = float(position.nan_to_num(nan=-torch.inf).amax())
-    return low, high
+    if not math.isnan(low):
+        return low, high, False
+    low = float(position.nan_to_num(nan=torch.inf).amin())
+    return low, float(position.nan_to_num(nan=-torch.inf).amax()), True
 
 
-def _as_dtype(sampled: Tensor, dtype: torch.dtype) -> Tensor:
-    if sampled.dtype == dtype or dtype.is_floating_point:
-        return sampled.to(dtype)
-    return sampled.round_().clamp_(0.0, float(torch.iinfo(dtype).max)).to(dtype)
+def _put(sampled: Tensor, out: Tensor) -> None:
+    """Samples into a tensor of any dtype, rounded and limited to what it holds."""
+    if sampled.dtype != out.dtype and not out.dtype.is_floating_point:
+        sampled = sampled.round_().clamp_(0.0, float(torch.iinfo(out.dtype).max)).to(out.dtype)
+    out.copy_(sampled)
 
 
 def _window(image: Tensor, lines: tuple[int, int], columns: tuple[int, int], coarser: tuple[float, float]) -> Tensor:
@@ -171,7 +187,9 @@ def _smoothed(image: Tensor, axis: int, coarser: float) -> Tensor:
     return smooth
 
 
-def _grid_sample(windows: Sequence[Tensor], column: Tensor, line: Tensor, mode: Interpolation) -> Sequence[Tensor]:
+def _grid_sample(
+    windows: Sequence[Tensor], column: Tensor, line: Tensor, mode: Interpolation, out: Sequence[Tensor]
+) -> None:
     (height, width), channels = windows[0].shape[:2], [window.shape[2] for window in windows]
     # With a power of two of intervals, grid_sample's way from a normalised position back to pixels rounds nothing.
     intervals = [2 ** math.ceil(math.log2(size - 1)) for size in (width, height)]
@@ -182,15 +200,17 @@ def _grid_sample(windows: Sequence[Tensor], column: Tensor, line: Tensor, mode: 
     grid = torch.empty(2, *column.shape)
     for axis, position, size in zip(grid, (column, line), intervals, strict=True):
         torch.mul(position, PIXEL_PARTS, out=axis).round_().mul_(2 / (PIXEL_PARTS * size)).sub_(1)
-    sampled = F.grid_sample(
-        source[None], grid.movedim(0, -1)[None], mode=mode, padding_mode="zeros", align_corners=True
-    )
-    return sampled[0].movedim(0, -1).split(channels, dim=-1)
+    at = grid.movedim(0, -1)[None]
+    sampled = F.grid_sample(source[None], at, mode=mode, padding_mode="zeros", align_corners=True)[0]
+    for part, into in zip(sampled.split(channels), out, strict=True):
+        _put(part, into.movedim(-1, 0))
 
 
-def _remap(windows: Sequence[Tensor], column: Tensor, line: Tensor, mode: Interpolation) -> Sequence[Tensor]:
-    across, along = column.numpy(), line.numpy()
-    remapped = [
-        cv2.remap(window.numpy(), across, along, _CV2_MODES[mode], borderMode=cv2.BORDER_CONSTANT) for window in windows
-    ]
-    return [torch.from_numpy(image).reshape(*column.shape, -1) for image in remapped]
+def _remap(windows: Sequence[Tensor], column: Tensor, line: Tensor, mode: Interpolation, out: Sequence[Tensor]) -> None:
+    maps = column.numpy(), line.numpy()
+    for window, into in zip(windows, out, strict=True):
+        options: dict[str, Any] = {"interpolation": _CV2_MODES[mode], "borderMode": cv2.BORDER_CONSTANT}
+        if window.dtype == into.dtype:
+            cv2.remap(window.numpy(), *maps, dst=into.numpy(), **options)
+        else:
+            _put(torch.from_numpy(cv2.remap(window.numpy(), *maps, **options)).view(into.shape), into)

@@ -6,7 +6,7 @@ green sees at (x, z) and travel y when the object has moved on by s / n2 of trav
 
 import math
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
@@ -51,27 +51,30 @@ class ColorLines:
     rows: Tensor | None = None
 
     def sample(
-        self, image: Tensor, first_line: int, line: Tensor, column: Tensor, height: Tensor, how: Sampling
-    ) -> Tensor:
-        """Colours ``(rows, columns, channels)`` of what green sees at a line and column of the scan and a height, mm.
+        self, image: Tensor, first_line: int, line: Tensor, column: Tensor, height: Tensor, how: Sampling, out: Tensor
+    ) -> None:
+        """Put into ``out`` the colours of what green sees at a line and column of the scan and a height, mm.
 
         Args:
             image: the lines ``image_range`` of the left image. line: counted from ``first_line`` of the scan.
+            out: ``(rows, columns, channels)``.
         """
         if self.shift_mm is None or self.rows is None:
-            return self._sampled(image, column, line, how, first_line - self.image_range[0])
+            self._sample(image, column, line, how, out, first_line - self.image_range[0])
+            return
         begin = first_line - self.start
         base = line.nan_to_num().floor().clamp(-begin, self.rows.shape[1] - 2 - begin)
         part, base = (line - base).double(), base.long() + begin
-        colors = []
         for channel, (shift, rows) in enumerate(zip(self.shift_mm, self.rows - self.image_range[0], strict=True)):
-            row = torch.lerp(rows[base], rows[base + 1], part)
-            colors.append(self._sampled(image[..., [channel]], self._column(column, height, shift), row, how))
-        return torch.cat(colors, dim=-1)
+            row, into = torch.lerp(rows[base], rows[base + 1], part), torch.empty_like(out[..., :1])
+            self._sample(image[..., [channel]], self._column(column, height, shift), row, how, into)
+            out[..., [channel]] = into
 
-    def _sampled(self, image: Tensor, column: Tensor, line: Tensor, how: Sampling, first_line: int = 0) -> Tensor:
-        mode, resampler = how.interpolation, how.resampler
-        return sample_image(image, column, line, mode, first_line=first_line, coarser=self.coarser, resampler=resampler)
+    def _sample(
+        self, image: Tensor, column: Tensor, line: Tensor, how: Sampling, out: Tensor, first_line: int = 0
+    ) -> None:
+        options: dict[str, Any] = {"coarser": self.coarser, "resampler": how.resampler, "first_line": first_line}
+        sample_image(image, column, line, how.interpolation, **options, out=out)
 
     def _column(self, column: Tensor, height: Tensor, shift: Tensor) -> Tensor:
         """Column at which a colour sees what green sees in another."""

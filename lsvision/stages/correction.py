@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from lsvision.geometry import line_at, product_axes, travel_at
-from lsvision.image.resampling import SAMPLED_TILE
+from lsvision.image.resampling import SAMPLED_TILES
 from lsvision.image.tiling import in_parallel, tiles
 from lsvision.image.visibility import Seen, Surface, see_cells
 from lsvision.stages.color_lines import ColorLines, color_lines
@@ -155,9 +155,9 @@ def _correct_rows(correction: _Correction, rows: tuple[int, int]) -> ProductStri
         if seen is None:
             return
         color = strip.color[tile]
-        for part in tiles(seen.line.shape[0], seen.line.shape[1], SAMPLED_TILE):
+        for part in tiles(len(color), color.shape[1], SAMPLED_TILES[correction.config.resampler]):
             at = seen.first_line, seen.line[part], seen.column[part], seen.height[part]
-            color[part] = lines.colors.sample(image, *at, correction.config)
+            lines.colors.sample(image, *at, correction.config, color[part])
         strip.valid[tile] = seen.measured
         strip.height[tile] = seen.height.masked_fill(~seen.measured, torch.nan)
         strip.source[tile][..., 0], strip.source[tile][..., 1] = seen.line + seen.first_line, seen.column

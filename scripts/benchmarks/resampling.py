@@ -20,7 +20,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lsvision.image.resampling import SAMPLED_TILE, Interpolation, Resampler, sample_images
+from lsvision.image.resampling import SAMPLED_TILES, Interpolation, Resampler, sample_images
 from lsvision.image.tiling import in_parallel, keep_freed_memory, tiles
 from lsvision.stages.correction import CorrectionConfig, correct_rows, correct_scan, plan_product
 from lsvision.stages.disparity import DisparityConfig, MatchedDepth
@@ -104,10 +104,10 @@ def resampling_speeds() -> tuple[dict[str, float], dict[str, float], dict[str, f
         made = torch.empty(*line.shape, 3, dtype=torch.uint8), torch.empty(*line.shape, 1)
 
         def fill(tile: tuple[slice, slice]) -> None:
-            parts = sample_images((color, depth), column[tile], line[tile], mode, resampler=resampler)
-            made[0][tile], made[1][tile] = parts
+            out = made[0][tile], made[1][tile]
+            sample_images((color, depth), column[tile], line[tile], mode, resampler=resampler, out=out)
 
-        in_parallel(fill, tiles(line.shape[0], line.shape[1], SAMPLED_TILE))
+        in_parallel(fill, tiles(len(line), line.shape[1], SAMPLED_TILES[resampler]))
         return made
 
     def bare(mode: Interpolation) -> tuple[Tensor, Tensor]:
