@@ -19,6 +19,7 @@ _ROUNDING = 1.0 / 6.0  # variance of the difference of two whole grey values
 # and that of another which interpolation has smoothed to 0.6 of it on average.
 _SLOPE_NOISE = 0.5 / 1.6
 _NOISE_RESIDUAL = 4.0  # times the noise's variance in one image; two have twice of it
+_HOPELESS = 5.0  # times the largest deviation: from there on a disparity is a guess, however well it fits
 _SMOOTH_PX = 4.0  # an interpolated value that differs by more from its block's own one mixes two surfaces
 
 
@@ -62,7 +63,7 @@ def refine_disparity(
         noise: standard deviation of the grey values' noise, on their scale.
         largest_change_px: a larger total change is not believed and undone.
         largest_sigma_px: a pixel known less well is dropped, unless its residual is no more than noise: ground without
-            texture says little, but a wrong match says the wrong thing.
+            texture says little, but a wrong match says the wrong thing. Five times that is no measurement at all.
 
     Returns:
         Values for each pixel of the left image.
@@ -88,7 +89,8 @@ def refine_disparity(
             current, deviation, residual = _refine_tile(pair, outer, column, window, iterations, noise)
             current = outer + _small(current.sub_(outer), largest_change_px)
             deviation.mul_(scatter)
-            current.masked_fill_((deviation > largest).logical_and_(residual > _NOISE_RESIDUAL * noise**2), torch.nan)
+            wrong = (deviation > largest).logical_and_(residual > _NOISE_RESIDUAL * noise**2)
+            current.masked_fill_(wrong.logical_or_(deviation > _HOPELESS * largest), torch.nan)
             tile = slice(block * start, block * stop), slice(block * first, block * last)
             into = refined[tile], sigma[tile]
             rest = [slice(block * (begin - out), None) for begin, out in ((start, above), (first, before))]

@@ -33,7 +33,8 @@ class DisparityConfig:
     ``left_right_check_px`` is the largest disagreement of the two views, ``fine_check_px`` that of the finer search.
     ``refine_iterations`` of local least squares over a window of ``refine_window`` px follow, as many as the matcher
     needs where it is None; 0 leaves the sixteenths of a pixel of ``sgbm``, which lean towards whole ones. A pixel that
-    is then known no better than ``largest_sigma_px``, though its residual is more than noise, is dropped.
+    is then known no better than ``largest_sigma_px``, though its residual is more than noise, is dropped, and so is one
+    known five times less well.
     ``block_lines`` are matched as one, with ``halo_lines`` beyond either end that are thrown away: blocks lie at
     multiples of their size in the scan, so that a line's disparity depends on nothing else. Workers take
     ``strip_lines`` at once, rounded up to whole blocks.

@@ -12,12 +12,13 @@ from lsvision.geometry import to_product, travel_at
 from lsvision.simulation import EncoderConfig, MotionConfig, SceneConfig, SensorConfig, scaled_rig, simulate
 from lsvision.stages.correction import CorrectionConfig, correct_scan, plan_product
 from lsvision.stages.disparity import DisparityConfig, MatchedDepth
+from lsvision.stages.uncertainty import sigma_of
 from lsvision.types import LineImage, Motion, Scan, TensorImage
 from tests.stages.rendered import BOARD, FULL_RIG
 
 # 2.1° about both axes: the motion lies 3° off the nominal.
 ASKEW = MotionConfig(angle_x_deg=2.1, angle_z_deg=-2.1)
-CONFIG = CorrectionConfig(height_range_mm=(-30.0, 30.0))
+CONFIG = CorrectionConfig(height_range_mm=(-30.0, 30.0), uncertainty=True)
 STEP_MM = 1.0  # between neighbouring samples: an occlusion edge
 
 
@@ -47,16 +48,20 @@ def rendered(kind: str, scale: float, stretch: float, lines: int, encoder: bool,
     return scan, depth, Motion(source.trajectory.n, torch.zeros(3, 3, dtype=torch.float64))
 
 
-def misplacement(scan: Scan, depth: LineImage, true: Tensor, motion: Motion, margin: int) -> tuple[Tensor, Tensor]:
-    """Distance in px of every measured cell from where the truth puts what it shows, and the error of its height, mm.
+def misplacement(
+    scan: Scan, depth: LineImage, true: Tensor, motion: Motion, margin: int
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Distance in px of every measured cell from where the truth puts what it shows, the error of its height, mm, and
+    the standard deviation that the product tells of that.
 
     Cells within ``margin`` samples of an occlusion edge are left out.
     """
     grid = plan_product(scan, motion, CONFIG)
-    strips = list(correct_scan(scan, depth, motion, CONFIG, grid))
+    strips = list(correct_scan(scan, depth, motion, CONFIG, grid, sigma_of(depth)))
     valid = torch.cat([strip.valid for strip in strips])
     line, column = torch.cat([strip.source for strip in strips])[valid].double().unbind(-1)
     height = torch.cat([strip.height for strip in strips])[valid].double()
+    sigma = torch.cat([strip.sigma[..., 2] for strip in strips])[valid].double()
     above, before = line.floor().clamp(0, len(true) - 2).long(), column.floor().clamp(0, true.shape[1] - 2).long()
     down, right = line - above, column - before
     upper, lower = (
@@ -73,7 +78,8 @@ def misplacement(scan: Scan, depth: LineImage, true: Tensor, motion: Motion, mar
     )
     clear = F.max_pool2d(edges[None].float(), 2 * margin + 1, 1, margin)[0][above, before] == 0
     assert clear.float().mean() > 0.5
-    return torch.hypot(across, along)[clear], (height - (scan.rig.zero_disparity_mm - q[:, 2]))[clear]
+    error = height - (scan.rig.zero_disparity_mm - q[:, 2])
+    return torch.hypot(across, along)[clear], error[clear], sigma[clear]
 
 
 @pytest.mark.parametrize("encoder", [False, True], ids=["constant", "encoder"])
@@ -81,7 +87,7 @@ def misplacement(scan: Scan, depth: LineImage, true: Tensor, motion: Motion, mar
 @pytest.mark.parametrize("kind", ["sheet", "rail"])
 def test_with_the_true_depth_nothing_is_out_of_place(kind: str, stretch: float, encoder: bool) -> None:
     scan, depth, motion = rendered(kind, 16.0, stretch, 200, encoder, right=False)
-    shift, error = misplacement(scan, TensorImage(depth[..., None]), depth, motion, 1)
+    shift, error, _ = misplacement(scan, TensorImage(depth[..., None]), depth, motion, 1)
     assert shift.max() < 0.002
     assert error.abs().max() < 1e-3
 
@@ -91,7 +97,9 @@ def test_with_the_true_depth_nothing_is_out_of_place(kind: str, stretch: float, 
 def test_at_full_size_the_matched_depth_puts_pixels_within_a_tenth(kind: str, stretch: float, encoder: bool) -> None:
     scan, true, motion = rendered(kind, 1.0, stretch, 320, encoder, right=True)
     fine = DisparityConfig(matcher="coarse_to_fine", refine_iterations=1, largest_sigma_px=0.2, halo_lines=48)
-    shift, error = misplacement(scan, MatchedDepth(scan, fine), true, motion, 24)
+    shift, error, sigma = misplacement(scan, MatchedDepth(scan, fine), true, motion, 24)
     assert shift.square().mean().sqrt() <= 0.1
+    assert (shift > 0.3).double().mean() <= 0.002
+    assert 0.7 < (error / sigma).square().mean().sqrt() < 1.3
     pixel_mm = scan.rig.zero_disparity_mm**2 / (scan.rig.focal_length_px * scan.rig.baseline_mm)
     assert error.abs().median() <= 0.09 * pixel_mm
