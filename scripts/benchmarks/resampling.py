@@ -6,7 +6,6 @@ is a copy of as many bytes as colour and height hold. Memory is that of a proces
 """
 
 import json
-import resource
 import statistics
 import subprocess
 import sys
@@ -20,19 +19,22 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from lsvision.image.brightness import gray_bytes
 from lsvision.image.resampling import SAMPLED_TILES, Interpolation, Resampler, sample_images
 from lsvision.image.tiling import in_parallel, keep_freed_memory, tiles
 from lsvision.stages.correction import CorrectionConfig, correct_rows, correct_scan, plan_product
-from lsvision.stages.disparity import DisparityConfig, MatchedDepth
-from lsvision.types import Motion, Rig, Scan, TensorImage, Travel
+from lsvision.stages.disparity import DisparityConfig, MatchedDepth, depth_of, disparity_range
+from lsvision.types import Motion, Rig, Scan, Travel
 
 RIG = Rig(7142, 10.0, 113.84, 354.0, 1042.0, 6099.0)
 PITCH = 0.07
 LINES, MEMORY_LINES = 8192, (8192, 32768, 131072)
+STEREO_LINES, STEREO_MEMORY_LINES = 4096, (8192, 32768)
 STRIP = 512
 TURNS = 3
 MOTION = Motion(torch.tensor([-0.03, 1.02, 0.02], dtype=torch.float64), torch.zeros(3, 3, dtype=torch.float64))
 CONFIG = CorrectionConfig(height_range_mm=(-30.0, 30.0), strip_rows=STRIP)
+MATCHING = DisparityConfig(largest_sigma_px=0.2)
 
 
 @dataclass(frozen=True)
@@ -71,7 +73,7 @@ def run() -> dict[str, object]:
     keep_freed_memory()
     ours, bare, largest = resampling_speeds()
     ratios = {name: round(ours[name] / bare[name.split()[0]], 2) for name in ours}
-    correction, one_pass = scan_speeds()
+    stereo = scan_speeds()
     return {
         "unit": "Mpx/s of the product",
         "resampling": {name: round(value, 1) for name, value in ours.items()},
@@ -81,10 +83,15 @@ def run() -> dict[str, object]:
         "ratio": ratios["bicubic grid_sample"],
         "largest_difference": largest,
         "correction_of_a_depth_map_scan": round(depth_map_speed(), 2),
-        "correction_of_a_stereo_scan": round(correction, 2),
-        "one_pass_sgbm_and_remap": round(one_pass, 2),
-        "stereo_ratio": round(correction / one_pass, 2),
+        "correction_of_a_stereo_scan": {name: round(value, 2) for name, value in stereo.items()},
+        "stereo_ratios": {
+            f"{ours} to {bare}": round(stereo[ours] / stereo[bare], 2)
+            for bare in stereo
+            if bare.startswith("sgbm")
+            for ours in ("grid_sample", "opencv")
+        },
         "megabytes": {str(lines): peak_megabytes(lines) for lines in MEMORY_LINES},
+        "megabytes_of_a_stereo_scan": {str(lines): peak_megabytes(lines, "stereo") for lines in STEREO_MEMORY_LINES},
     }
 
 
@@ -143,32 +150,46 @@ def depth_map_speed() -> float:
     return grid.rows * grid.columns / (time.perf_counter() - begin) / 1e6
 
 
-def scan_speeds() -> tuple[float, float]:
-    """Mpx/s of correcting a stereo scan, matched from coarse to fine, and of one-pass SGBM with ``cv2.remap``."""
+def stereo_scan(lines: int) -> Scan:
+    """A textured plane in two views, as long as it is wanted."""
     generator = torch.Generator().manual_seed(0)
-    texture = torch.randint(0, 256, (2 * STRIP, RIG.width_px + 200, 3), dtype=torch.uint8, generator=generator)
+    texture = torch.randint(0, 256, (1024, RIG.width_px + 200, 3), dtype=torch.uint8, generator=generator)
     texture = torch.from_numpy(cv2.GaussianBlur(texture.numpy(), (0, 0), 1.5))
-    left, right = TensorImage(texture[:, 100:-100].contiguous()), TensorImage(texture[:, 80:-120].contiguous())
-    scan = Scan(Path("made"), RIG, Travel(PITCH), left, right, None)
-    grid = plan_product(scan, MOTION, CONFIG)
-    fine = replace(
-        DisparityConfig(), matcher="coarse_to_fine", refine_iterations=1, largest_sigma_px=0.2, halo_lines=48
-    )
-    maps = [np.ascontiguousarray(values) for values in np.meshgrid(np.arange(7142.0), np.arange(2.0 * STRIP))]
-    maps = [values.astype(np.float32) + 0.3 for values in maps]
+    left, right = (Repeated(texture[:, start : start + RIG.width_px].contiguous(), lines) for start in (100, 80))
+    return Scan(Path("made"), RIG, Travel(PITCH), left, right, None)
 
-    def ours() -> None:
-        for _ in correct_scan(scan, MatchedDepth(scan, fine), MOTION, CONFIG, grid):
+
+def scan_speeds() -> dict[str, float]:
+    """Mpx/s of correcting a stereo scan, matching included, and of OpenCV alone: SGBM over the same range and a remap.
+
+    OpenCV's SGBM has two ways through the costs in one pass: five directions on one thread, or three on all.
+    """
+    scan = stereo_scan(STEREO_LINES)
+    grid = plan_product(scan, MOTION, CONFIG)
+    left, right = (image.read(0, 1024) for image in (scan.left, scan.right) if image is not None)
+    maps = [values.astype(np.float32) + 0.3 for values in np.meshgrid(np.arange(7142.0), np.arange(1024.0))]
+    gray = [gray_bytes(image).numpy() for image in (left, right)]
+    low, high = disparity_range(RIG, MATCHING)
+    count = high - low + 1 + -(high - low + 1) % 16
+
+    def ours(resampler: Resampler) -> None:
+        for _ in correct_scan(scan, MatchedDepth(scan, MATCHING), MOTION, replace(CONFIG, resampler=resampler), grid):
             pass
 
-    def one_pass() -> None:
-        depth = MatchedDepth(scan, replace(DisparityConfig(), matcher="sgbm", refine_iterations=0)).read(0, scan.lines)
-        cv2.remap(left.tensor.numpy(), *maps, cv2.INTER_CUBIC)
-        cv2.remap(depth.numpy(), *maps, cv2.INTER_LINEAR)
+    def one_pass(mode: int) -> None:
+        matcher = cv2.StereoSGBM.create(low, count, 5, 200, 800, 10, 0, 5, 100, 1, mode)
+        depth = matcher.compute(*gray).astype(np.float32)
+        cv2.remap(left.numpy(), *maps, cv2.INTER_CUBIC)
+        cv2.remap(depth, *maps, cv2.INTER_LINEAR)
 
-    seconds = median_seconds({"ours": ours, "one pass": one_pass}, turns=1)
-    cells = scan.lines * RIG.width_px
-    return cells / seconds["ours"] / 1e6, cells / seconds["one pass"] / 1e6
+    sides: dict[str, tuple[int, Callable[[], None]]] = {
+        "grid_sample": (STEREO_LINES, lambda: ours("grid_sample")),
+        "opencv": (STEREO_LINES, lambda: ours("opencv")),
+        "sgbm of three directions and remap": (1024, lambda: one_pass(cv2.STEREO_SGBM_MODE_SGBM_3WAY)),
+        "sgbm of five directions and remap": (1024, lambda: one_pass(cv2.STEREO_SGBM_MODE_SGBM)),
+    }
+    seconds = median_seconds({name: side for name, (_, side) in sides.items()}, turns=1)
+    return {name: lines * RIG.width_px / seconds[name] / 1e6 for name, (lines, _) in sides.items()}
 
 
 def memcpy_speed() -> float:
@@ -191,20 +212,20 @@ def median_seconds(sides: dict[str, Callable[[], object]], turns: int = TURNS) -
     return {name: statistics.median(values) for name, values in taken.items()}
 
 
-def peak_megabytes(lines: int) -> int:
-    """Peak memory of a process that corrects a depth-map scan of a number of lines; the strips in between are left out.
-
-    Only the first and the last strips of the longer scans are computed: the memory is that of a strip.
-    """
-    code = f"import resampling; resampling.correct_and_report({lines})"
+def peak_megabytes(lines: int, kind: str = "depth") -> int:
+    """Peak memory of a process that corrects a scan of a number of lines, with a depth map or stereo."""
+    code = f"import resampling; resampling.correct_and_report({lines}, {kind!r})"
     folder = str(Path(__file__).parent)
     result = subprocess.run([sys.executable, "-c", code], cwd=folder, capture_output=True, text=True, check=True)
     return int(json.loads(result.stdout.splitlines()[-1]))
 
 
-def correct_and_report(lines: int) -> None:
+def correct_and_report(lines: int, kind: str) -> None:
     """Correct a scan and print the megabytes that it took."""
-    scan = surface_scan(lines)
-    for _ in correct_scan(scan, scan.depth, MOTION, CONFIG):
+    keep_freed_memory()
+    scan = stereo_scan(lines) if kind == "stereo" else surface_scan(lines)
+    for _ in correct_scan(scan, depth_of(scan, MATCHING), MOTION, CONFIG):
         pass
-    print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024)
+    # Not getrusage: its maximum begins with that of the process that started this one.
+    status = dict(line.split(":", 1) for line in Path("/proc/self/status").read_text().splitlines())
+    print(int(status["VmHWM"].split()[0]) // 1024)
