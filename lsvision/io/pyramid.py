@@ -31,7 +31,7 @@ def halve(block: Tensor, *, average: bool) -> Tensor:
         block: ``(rows, columns)`` or ``(rows, columns, channels)``; the last row and column are repeated where odd.
     """
     if not average:
-        return block[::2, ::2].contiguous()
+        return block[::2, ::2].clone()  # in the same order of memory
     rows, columns = block.shape[:2]
     even = np.pad(block.numpy(force=True), ((0, rows % 2), (0, columns % 2), (0, 0)), mode="edge")
     size = (even.shape[1] // 2, even.shape[0] // 2)

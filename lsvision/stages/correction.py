@@ -262,6 +262,7 @@ def _empty_strip(correction: _Correction, rows: tuple[int, int]) -> ProductStrip
         color=torch.zeros(*shape, left.shape[2], dtype=left.dtype),
         height=torch.full(shape, torch.nan),
         valid=torch.zeros(shape, dtype=torch.bool),
-        source=torch.full((*shape, 2), torch.nan),
-        sigma=torch.full((*shape, 3), torch.nan) if correction.config.uncertainty else None,
+        # Plane by plane in memory, as they are filled and as products are stored.
+        source=torch.full((2, *shape), torch.nan).movedim(0, -1),
+        sigma=torch.full((3, *shape), torch.nan).movedim(0, -1) if correction.config.uncertainty else None,
     )
