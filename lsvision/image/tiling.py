@@ -6,7 +6,7 @@ import os
 import sys
 import threading
 from collections.abc import Callable, Iterable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from typing import TypeVar
 
 import torch
@@ -37,11 +37,19 @@ def in_parallel(work: Callable[[Item], Result], items: Iterable[Item]) -> list[R
     """Results of ``work`` on every item, in order: one thread an item, ``torch.get_num_threads()`` at a time.
 
     On pieces this small, threads that share every single operation would spend their time waiting for each other.
+
+    Raises:
+        Exception: what the first item that failed raised, when none is worked on any more.
     """
     threads = torch.get_num_threads()
     if threads == 1:
         return [work(item) for item in items]
-    return list(_pool(threads, os.getpid()).map(work, items))
+    pool = _pool(threads, os.getpid())
+    futures = [pool.submit(work, item) for item in items]
+    try:
+        return [future.result() for future in futures]
+    finally:
+        wait([future for future in futures if not future.cancel()])
 
 
 @functools.cache

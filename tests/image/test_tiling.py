@@ -1,5 +1,7 @@
 """Tiles cover a plane once; work in threads keeps its order and the thread setting."""
 
+import threading
+
 import pytest
 import torch
 
@@ -27,6 +29,25 @@ def test_an_error_in_a_thread_reaches_the_caller() -> None:
     with pytest.raises(ZeroDivisionError):
         in_parallel(lambda item: 1 // item, [1, 0, 2])
     assert torch.get_num_threads() == 2
+
+
+def test_no_thread_is_at_work_any_more_when_an_error_reaches_the_caller() -> None:
+    torch.set_num_threads(2)
+    begun, failed, finished = threading.Event(), threading.Event(), []
+
+    def work(item: int) -> None:
+        if item == 0:
+            begun.wait()
+            failed.set()
+            raise ZeroDivisionError
+        begun.set()
+        failed.wait()
+        torch.ones(2000, 2000).cumsum(0).cumsum(1)
+        finished.append(item)
+
+    with pytest.raises(ZeroDivisionError):
+        in_parallel(work, [0, 1])
+    assert finished == [1]
 
 
 def test_keeping_memory_is_harmless() -> None:
