@@ -106,7 +106,9 @@ class DaskEngine:
             if self._cluster is not None and self._threads < self._workers:
                 self._cluster.scale(self._workers)  # one that died while it started is not replaced by itself
             with suppress(Empty):
-                return [self._take(self._done.get(timeout=_LOOK_SECONDS))]
+                finished = self._take(self._done.get(timeout=_LOOK_SECONDS))
+                if finished is not None:
+                    return [finished]
 
     def _count_threads(self) -> int:
         try:
@@ -114,14 +116,18 @@ class DaskEngine:
         except OSError as error:
             raise _lost() from error
 
-    def _take(self, future: Future) -> Finished:
-        task = self._tasks.pop(future)
+    def _take(self, future: Future) -> Finished | None:
+        """A task and its result; None where that died with the worker that kept it, and the task runs again."""
         try:
-            return task, future.result()
+            result = future.result(timeout=_LOOK_SECONDS)
+        except TimeoutError:  # not waited for here: it may be for workers that only the next look starts
+            future.add_done_callback(self._done.put)
+            return None
         except KilledWorker:
-            return task, TaskResult(error=f"{MOST_DEATHS} workers died at it, of memory or a signal")
+            result = TaskResult(error=f"{MOST_DEATHS} workers died at it, of memory or a signal")
         except (CancelledError, OSError) as error:
             raise _lost() from error
+        return self._tasks.pop(future), result
 
 
 def _lost() -> LsvisionError:

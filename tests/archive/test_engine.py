@@ -2,6 +2,7 @@
 
 import os
 import signal
+import time
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -83,6 +84,22 @@ def test_dask_brings_every_task_back_once_though_workers_die(tmp_path):
     assert [found[task].measured for task in tasks] == list(range(12))
     assert found[once].value == "survived"
     assert found[always].error == "3 workers died at it, of memory or a signal"
+
+
+@pytest.mark.slow
+def test_dask_runs_a_task_again_whose_result_died_with_all_workers():
+    pytest.importorskip("distributed")
+    from lsvision.archive.dask_engine import DaskEngine
+
+    task = Task("a", Number(5))
+    with DaskEngine(None, 1, 3072) as engine:
+        engine.submit(task)
+        future = engine._done.get(timeout=60)
+        engine._client.sync(engine._cluster.workers[0].close)  # its nanny with it: nobody starts another by himself
+        while engine._client.nthreads():
+            time.sleep(0.01)
+        assert engine._take(future) is None
+        assert [(found, result.measured) for found, result in engine.collect()] == [(task, 5)]
 
 
 @pytest.mark.parametrize(

@@ -23,6 +23,7 @@ psutil = pytest.importorskip("psutil")
 
 MOMENTS = 10
 STRIPS = 6 * 13 + 12 * 14
+MOST_SECONDS = 300
 
 
 @pytest.fixture(scope="module")
@@ -47,7 +48,7 @@ def start(archive: Path, output: Path, *options: str) -> subprocess.Popen:
 
 
 def finish(process: subprocess.Popen) -> str:
-    output, _ = process.communicate(timeout=300)
+    output, _ = process.communicate(timeout=MOST_SECONDS)
     assert process.returncode == 0, output
     return output
 
@@ -72,9 +73,13 @@ def done_strips(output: Path) -> dict[tuple[str, str, int], tuple[float, int]]:
 
 
 def wait_for(process: subprocess.Popen, output: Path, strips: int) -> None:
-    """Until so many strips are done, and a random moment more."""
+    """Until so many strips are done, and a random moment more; a run that stands still is ended and fails the test."""
+    last = time.monotonic() + MOST_SECONDS
     while process.poll() is None and len(done_strips(output)) < strips:
         time.sleep(0.01)
+        if time.monotonic() > last:
+            os.killpg(process.pid, signal.SIGKILL)
+            pytest.fail(f"{strips} strips are not done after {MOST_SECONDS} s:\n{process.communicate()[0]}")
     time.sleep(random.random() * 0.05)
 
 
@@ -115,7 +120,7 @@ def test_a_worker(archive, undisturbed, tmp_path, engine):
         while process.poll() is None and not kill_a_worker(process.pid):
             time.sleep(0.01)  # those killed before are being replaced
         killed += process.poll() is None
-    output, _ = process.communicate(timeout=300)
+    output, _ = process.communicate(timeout=MOST_SECONDS)
     assert killed >= MOMENTS - 2, output
     if process.returncode:  # a strip whose worker was hit three times is given up, and made by the next run
         assert "3 workers died at it" in output, output
