@@ -14,7 +14,7 @@ import torch
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
-_TILE = (512, 480)  # rows and columns; tall, for what a tile sees lies in more lines than it has rows
+TILE = (512, 480)  # rows and columns; tall, for what a tile sees lies in more lines than it has rows
 
 # Positions are rounded to this part of a pixel: float32 holds such a fraction of up to 8192 pixels exactly, so that
 # what is sampled there does not depend on the tile it is counted from.
@@ -24,7 +24,7 @@ _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD, _M_ARENA_MAX = -1, -3, -8  # of glibc's ma
 _KEPT_BYTES = 256 * 2**20
 
 
-def tiles(rows: int, columns: int, size: tuple[int, int] = _TILE) -> list[tuple[slice, slice]]:
+def tiles(rows: int, columns: int, size: tuple[int, int] = TILE) -> list[tuple[slice, slice]]:
     """Row and column ranges of the tiles of a plane, each of at most ``size`` rows and columns."""
     return [
         (slice(row, min(row + size[0], rows)), slice(column, min(column + size[1], columns)))

@@ -108,6 +108,7 @@ class _Segments:
 
     @classmethod
     def of(cls, surface: Surface, dim: Literal[0, 1]) -> "_Segments":
+        """Those of a surface along an axis."""
         along = (-1, 1) if dim == 0 else (1, -1)
         whole, next_whole = _ends(surface.whole.view(along), dim)
         part, next_part = _ends(surface.part, dim)

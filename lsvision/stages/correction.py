@@ -14,7 +14,7 @@ from torch import Tensor
 
 from lsvision.geometry import line_at, product_axes, travel_at
 from lsvision.image.resampling import SAMPLED_TILES
-from lsvision.image.tiling import in_parallel, tiles
+from lsvision.image.tiling import TILE, in_parallel, tiles
 from lsvision.image.visibility import Seen, Surface, see_cells
 from lsvision.stages.color_lines import ColorLines, color_lines
 from lsvision.stages.product_grid import CorrectionConfig, ProductGrid, plan_product
@@ -24,6 +24,8 @@ from lsvision.types import LineImage, Motion, Scan
 
 # Lines missing between two from which on nothing counts as measured there; a camera that runs free misses a few.
 _MISSED_LINES = 3
+# Lines under a tile, of the 8192 over which ``PIXEL_PARTS`` are exact: slope and relief of the object add to them.
+_TILE_LINES = 4096
 
 
 @dataclass(frozen=True)
@@ -99,6 +101,7 @@ class _Correction:
         grid: ProductGrid,
         depth_sigma: LineImage | None,
     ) -> "_Correction":
+        """From what ``correct_scan`` takes."""
         rig = scan.rig
         step = config.step_px * rig.zero_disparity_mm**2 / (rig.focal_length_px * rig.baseline_mm)
         low, high = config.height_range_mm
@@ -151,6 +154,7 @@ def _correct_rows(correction: _Correction, rows: tuple[int, int]) -> ProductStri
     image = scan.left.read(*lines.colors.image_range)
 
     def fill(tile: tuple[slice, slice]) -> None:
+        """Put what a tile sees into the strip."""
         seen = _locate(correction, lines, rows[0], *tile)
         if seen is None:
             return
@@ -167,7 +171,9 @@ def _correct_rows(correction: _Correction, rows: tuple[int, int]) -> ProductStri
             sigma = position_sigma(scan, motion, line, column, q_z, correction.config.disparity_sigma_px, seen.sigma)
             strip.sigma[tile] = sigma.masked_fill_(~seen.measured[..., None], torch.nan)
 
-    in_parallel(fill, tiles(rows[1] - rows[0], correction.grid.columns))
+    # Where cells are coarse, fewer rows hold as many lines as a place can be counted through.
+    size = min(TILE[0], max(1, int(_TILE_LINES / _spacing(correction)[0]))), TILE[1]
+    in_parallel(fill, tiles(rows[1] - rows[0], correction.grid.columns, size))
     return strip
 
 

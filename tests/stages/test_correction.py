@@ -245,3 +245,17 @@ def test_rows_beyond_the_scan_are_empty():
     assert not strip.valid.any()
     assert strip.height.isnan().all()
     assert strip.source.isnan().all()
+
+
+@pytest.mark.parametrize("resampler", ["grid_sample", "opencv"])
+def test_an_overview_of_many_lines_a_cell_is_the_same_in_any_strips(resampler):
+    lines, pitch = 12_000, 20 * PITCH
+    motion, scan = motion_of((0.03, 1.01, -0.02)), scan_of(torch.full((lines, RIG.width_px), DEPTH), Travel(PITCH))
+    config = dataclasses.replace(CONFIG, pitch_mm=pitch, resampler=resampler)
+    made = []
+    for rows in (64, 10_000):
+        strips = list(correct_scan(scan, scan.depth, motion, dataclasses.replace(config, strip_rows=rows)))
+        made.append(torch.cat([strip.color for strip in strips]))
+    assert len(made[0]) > 500
+    assert torch.equal(*made)
+    assert (made[0] > 0).any()
