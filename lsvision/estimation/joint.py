@@ -104,6 +104,7 @@ def measurement(
     blocks, size = measured.shape[-2:]
 
     def linearise(mean: Tensor, factor: Tensor) -> Rows:
+        """Rows of all blocks, by statistical linear regression."""
         A, b, error = slr(lambda x: h(x).flatten(-2), mean, lower_factor(factor))
         residual = measured - (apply(A, mean) + b).unflatten(-1, (blocks, size))
         residual = torch.where(valid[..., None], residual, 0.0)

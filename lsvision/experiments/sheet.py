@@ -48,6 +48,7 @@ def points_in_scan(scan: Scan, depth: LineImage, simulation: Simulation) -> Shee
     expected = torch.stack([u, line_at(scan.travel, true[:, 1])], dim=-1)
 
     def to_sheet(pixel: Tensor) -> Tensor:
+        """Place on the sheet, mm, of a pixel of the scan."""
         slope = (pixel[..., 0] - scan.rig.principal_left_px) / scan.rig.focal_length_px
         ray = torch.stack([slope, torch.zeros_like(slope), torch.ones_like(slope)], dim=-1)
         shifted = travel_at(scan.travel, pixel[..., 1])[..., None] * n - pose.translation
@@ -71,6 +72,7 @@ def points_in_product(
     expected = (transform(rotation, translation, sheet)[:, :2] - origin) / grid.pitch_mm
 
     def to_sheet(pixel: Tensor) -> Tensor:
+        """Place on the sheet, mm, of a cell of the product."""
         q = pixel * grid.pitch_mm + origin - translation[:2]
         normal = rotation[:, 2]
         q_z = -(q @ normal[:2]) / normal[2]

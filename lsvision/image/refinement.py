@@ -80,6 +80,7 @@ def refine_disparity(
     scatter, largest = _scatter_gain(window, iterations), largest_sigma_px or math.inf
 
     def refine_rows(rows: tuple[int, int, int, int]) -> None:
+        """Refine a row of tiles."""
         above, start, stop, below = rows
         left_rows, right_rows = (_whole_blocks(image, above, below, block) for image in (left, right))
         for before, first, last, after in _tiles(disparity.shape[1], _TILE_COLUMNS // block, reach):
@@ -92,14 +93,17 @@ def refine_disparity(
             wrong = (deviation > largest).logical_and_(residual > _NOISE_RESIDUAL * noise**2)
             current.masked_fill_(wrong.logical_or_(deviation > _HOPELESS * largest), torch.nan)
             tile = slice(block * start, block * stop), slice(block * first, block * last)
-            into = refined[tile], sigma[tile]
-            rest = [slice(block * (begin - out), None) for begin, out in ((start, above), (first, before))]
-            inner = tuple(slice(skip.start, skip.start + n) for skip, n in zip(rest, into[0].shape, strict=True))
-            into[0].copy_(enlarged(current, block)[inner])
-            torch.add(into[0] - into[0], _repeated(deviation, block)[inner], out=into[1])
+            _put_blocks((current, deviation), block, (start - above, first - before), (refined[tile], sigma[tile]))
 
     in_parallel(refine_rows, _tiles(disparity.shape[0], _TILE_LINES // block, reach))
     return RefinedDisparity(refined, sigma)
+
+
+def _put_blocks(blocks: tuple[Tensor, Tensor], block: int, skip: tuple[int, int], out: tuple[Tensor, Tensor]) -> None:
+    """Put disparity and deviation of blocks, but for the first rows and columns of them, into the pixels of a tile."""
+    inner = tuple(slice(block * n, block * n + size) for n, size in zip(skip, out[0].shape, strict=True))
+    out[0].copy_(enlarged(blocks[0], block)[inner])
+    torch.add(out[0] - out[0], _repeated(blocks[1], block)[inner], out=out[1])  # NaN where the disparity is
 
 
 def enlarged(disparity: Float[Tensor, "rows columns"], block: int) -> Float[Tensor, "lines width"]:

@@ -187,6 +187,7 @@ def _given_rest(problem: BoardProblem, state: Tensor, part: slice) -> Linearise:
     """Linearisation in one part of the state, the rest known to be what it is."""
 
     def rows(mean: Tensor, factor: Tensor) -> Rows:
+        """Rows of the whole state, as seen by the part."""
         full, spread = state.clone(), _point(state).clone()
         full[..., part], spread[..., part, part] = mean, factor
         whole = linearise(problem, full, spread)
