@@ -8,6 +8,7 @@ from queue import Empty, SimpleQueue
 from types import TracebackType
 
 import dask
+from dask.task_spec import Task as Spec
 from distributed import Client, Future, KilledWorker, LocalCluster
 
 from lsvision.archive.engine import MOST_DEATHS, Finished
@@ -89,7 +90,10 @@ class DaskEngine:
 
     def submit(self, task: Task) -> None:
         """Hand a task to the scheduler."""
-        future = self._client.submit(run_task, task, key=f"{task.stage or 'step'}-{os.urandom(8).hex()}", pure=False)
+        key = f"{task.stage or 'step'}-{os.urandom(8).hex()}"
+        # One that produces data waits at the scheduler however few there are; others only where there are many.
+        spec = Spec(key, run_task, task, _data_producer=True)
+        future = self._client.get({key: spec}, key, sync=False)
         self._tasks[future] = task
         future.add_done_callback(self._done.put)
 

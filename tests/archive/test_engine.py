@@ -48,6 +48,17 @@ class Number:
         return TaskResult(measured=self.number)
 
 
+@dataclass(frozen=True)
+class Asleep:
+    """Takes a while."""
+
+    seconds: float
+
+    def run(self) -> TaskResult:
+        time.sleep(self.seconds)
+        return TaskResult()
+
+
 def collected(engine, tasks) -> dict:
     waiting, found, out = list(tasks), [], 0
     while waiting or out:
@@ -84,6 +95,21 @@ def test_dask_brings_every_task_back_once_though_workers_die(tmp_path):
     assert [found[task].measured for task in tasks] == list(range(12))
     assert found[once].value == "survived"
     assert found[always].error == "3 workers died at it, of memory or a signal"
+
+
+@pytest.mark.slow
+def test_dask_lets_no_task_wait_where_another_could_end_the_worker():
+    pytest.importorskip("distributed")
+    from lsvision.archive.dask_engine import DaskEngine
+
+    with DaskEngine(None, 1, 3072) as engine:
+        for number in range(2):
+            engine.submit(Task(f"{number}", Asleep(1.0)))
+        most = 0
+        while engine._done.empty():
+            most = max([most, *map(len, engine._client.processing().values())])
+        assert most == 1
+        assert len([*engine.collect(), *engine.collect()]) == 2
 
 
 @pytest.mark.slow
