@@ -9,7 +9,7 @@ from types import TracebackType
 
 import dask
 from dask.task_spec import Task as Spec
-from distributed import Client, Future, KilledWorker, LocalCluster
+from distributed import Client, Future, KilledWorker, LocalCluster, Status
 
 from lsvision.archive.engine import MOST_DEATHS, Finished
 from lsvision.archive.tasks import Task, TaskResult, run_task
@@ -17,7 +17,8 @@ from lsvision.errors import ConfigError, LsvisionError
 
 _LOOK_SECONDS = 1.0
 
-# Tasks wait at the scheduler, not at a worker: the death of one says something of its own task alone. A local worker
+# Tasks wait at the scheduler, not at a worker: the death of one says something of its own task alone. Dask does not
+# look after local workers that are gone for long: it would end those that are just starting again. A local worker
 # loads what tasks need before it takes one, so that no task answers for that time. It keeps freed memory for the next
 # strip: Dask's own setting gives it back after every operation, which trebles the time.
 _SETTINGS = {
@@ -27,6 +28,7 @@ _SETTINGS = {
     "distributed.worker.profile.enabled": False,
     "distributed.scheduler.allowed-failures": MOST_DEATHS - 1,
     "distributed.scheduler.worker-saturation": 1.0,
+    "distributed.deploy.lost-worker-timeout": "365 days",
     "distributed.comm.timeouts.connect": "10s",
 }
 # What matters of workers that come and go is in the results.
@@ -108,7 +110,7 @@ class DaskEngine:
                 raise _lost()
             self._threads = self._count_threads()
             if self._cluster is not None and self._threads < self._workers:
-                self._cluster.scale(self._workers)  # one that died while it started is not replaced by itself
+                self._cluster.sync(_replace_lost, self._cluster)
             with suppress(Empty):
                 finished = self._take(self._done.get(timeout=_LOOK_SECONDS))
                 if finished is not None:
@@ -132,6 +134,14 @@ class DaskEngine:
         except (CancelledError, OSError) as error:
             raise _lost() from error
         return self._tasks.pop(future), result
+
+
+async def _replace_lost(cluster: LocalCluster) -> None:
+    """Have workers started for those that died while they started, which are not replaced by themselves."""
+    for name, nanny in list(cluster.workers.items()):
+        if nanny.status in (Status.closed, Status.failed):
+            del cluster.workers[name]
+    cluster.scale(len(cluster.worker_spec))
 
 
 def _lost() -> LsvisionError:
