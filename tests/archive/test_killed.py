@@ -1,6 +1,7 @@
 """kill -9 of a worker, of the whole run and of the Dask scheduler, at random moments: nothing lost, nothing twice."""
 
 import contextlib
+import itertools
 import os
 import random
 import re
@@ -10,7 +11,7 @@ import sqlite3
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -73,14 +74,19 @@ def done_strips(output: Path) -> dict[tuple[str, str, int], tuple[float, int]]:
 
 
 def wait_for(process: subprocess.Popen, output: Path, strips: int) -> None:
-    """Until so many strips are done, and a random moment more; a run that stands still is ended and fails the test."""
+    """Until so many strips are done, and a random moment more."""
+    wait_until(process, lambda: len(done_strips(output)) >= strips)
+    time.sleep(random.random() * 0.05)
+
+
+def wait_until(process: subprocess.Popen, reached: Callable[[], bool]) -> None:
+    """Or until the run is over; one that stands still is ended and fails the test."""
     last = time.monotonic() + MOST_SECONDS
-    while process.poll() is None and len(done_strips(output)) < strips:
+    while process.poll() is None and not reached():
         time.sleep(0.01)
         if time.monotonic() > last:
             os.killpg(process.pid, signal.SIGKILL)
-            pytest.fail(f"{strips} strips are not done after {MOST_SECONDS} s:\n{process.communicate()[0]}")
-    time.sleep(random.random() * 0.05)
+            pytest.fail(f"stands still:\n{process.communicate()[0]}")
 
 
 def moments() -> list[int]:
@@ -113,19 +119,29 @@ def test_the_whole_run(archive, undisturbed, tmp_path):
 
 @pytest.mark.parametrize("engine", ["local", "dask"])
 def test_a_worker(archive, undisturbed, tmp_path, engine):
-    process = start(archive, tmp_path / "o", f"engine={engine}")
+    killed, most = 0, time.monotonic() + MOST_SECONDS
+    for turn in itertools.count():
+        output = tmp_path / f"o{turn}"
+        killed += run_and_kill_workers(archive, output, engine)
+        assert_whole(output, undisturbed)
+        if killed >= MOMENTS - 2:  # else it was done before there was time to kill
+            return
+        assert time.monotonic() < most, f"{killed} workers killed in {turn + 1} runs"
+
+
+def run_and_kill_workers(archive: Path, output: Path, engine: str) -> int:
+    """Take a run to its end, a worker killed at each moment that is reached; how many were."""
+    process = start(archive, output, f"engine={engine}")
     killed = 0
     for strips in moments():
-        wait_for(process, tmp_path / "o", strips)
-        while process.poll() is None and not kill_a_worker(process.pid):
-            time.sleep(0.01)  # those killed before are being replaced
+        wait_for(process, output, strips)
+        wait_until(process, lambda: kill_a_worker(process.pid))  # those killed before are being replaced
         killed += process.poll() is None
-    output, _ = process.communicate(timeout=MOST_SECONDS)
-    assert killed >= MOMENTS - 2, output
+    told, _ = process.communicate(timeout=MOST_SECONDS)
     if process.returncode:  # a strip whose worker was hit three times is given up, and made by the next run
-        assert "3 workers died at it" in output, output
-        finish(start(archive, tmp_path / "o", f"engine={engine}"))
-    assert_whole(tmp_path / "o", undisturbed)
+        assert "3 workers died at it" in told, told
+        finish(start(archive, output, f"engine={engine}"))
+    return killed
 
 
 def kill_a_worker(run: int) -> bool:
