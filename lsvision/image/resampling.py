@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import cv2
+import numpy as np
 import torch
 import torch.nn.functional as F  # noqa: N812
 from jaxtyping import Float
@@ -105,7 +106,7 @@ class _Axis:
         With ``whole`` the window is all of the image where that holds enough.
         """
         low, high, gaps = _ends(position)
-        if low > high:
+        if math.isnan(low):
             return None
         if low < -first or high > size - 1 - first:
             position = position.clamp(-first, size - 1 - first)
@@ -123,12 +124,13 @@ class _Axis:
 
 
 def _ends(position: Tensor) -> tuple[float, float, bool]:
-    """Least and greatest of what is not NaN, infinities the wrong way round where all are; and whether any is."""
-    low, high = (float(end) for end in torch.aminmax(position))
-    if not math.isnan(low):
-        return low, high, False
-    low = float(position.nan_to_num(nan=torch.inf).amin())
-    return low, float(position.nan_to_num(nan=-torch.inf).amax()), True
+    """Least and greatest of what is not NaN, both NaN where all are; and whether any is.
+
+    NumPy's reductions pass over NaN, torch's would need copies without.
+    """
+    values = position.numpy()
+    low, high = (float(end.reduce(values, axis=None)) for end in (np.fmin, np.fmax))
+    return low, high, math.isnan(position.sum())
 
 
 def _put(sampled: Tensor, out: Tensor) -> None:

@@ -105,14 +105,15 @@ def resampling_speeds() -> tuple[dict[str, float], dict[str, float], dict[str, f
     stop = int(source[..., 0].nan_to_num(nan=0.0).max()) + 5
     line, column = source[..., 0] - start, source[..., 1].contiguous()
     filled = [values.nan_to_num(nan=8.0).numpy() for values in (column, line)]  # the peer knows no holes
-    color, depth = scan.left.read(start, stop), scan.depth.read(start, stop).nan_to_num(nan=797.0)
+    color = scan.left.read(start, stop)
+    height = (RIG.zero_disparity_mm - scan.depth.read(start, stop)).nan_to_num(nan=0.0)
 
     def ours(mode: Interpolation, resampler: Resampler) -> tuple[Tensor, Tensor]:
         made = torch.empty(*line.shape, 3, dtype=torch.uint8), torch.empty(*line.shape, 1)
 
         def fill(tile: tuple[slice, slice]) -> None:
             out = made[0][tile], made[1][tile]
-            sample_images((color, depth), column[tile], line[tile], mode, resampler=resampler, out=out)
+            sample_images((color, height), column[tile], line[tile], mode, resampler=resampler, out=out)
 
         in_parallel(fill, tiles(len(line), line.shape[1], SAMPLED_TILES[resampler]))
         return made
@@ -120,8 +121,8 @@ def resampling_speeds() -> tuple[dict[str, float], dict[str, float], dict[str, f
     def bare(mode: Interpolation) -> tuple[Tensor, Tensor]:
         flag = {"bilinear": cv2.INTER_LINEAR, "bicubic": cv2.INTER_CUBIC}[mode]
         sampled = cv2.remap(color.numpy(), *filled, flag, borderMode=cv2.BORDER_REPLICATE)
-        height = cv2.remap(depth.numpy(), *filled, flag, borderMode=cv2.BORDER_REPLICATE)
-        return torch.from_numpy(sampled), torch.from_numpy(height)[..., None]
+        heights = cv2.remap(height.numpy(), *filled, flag, borderMode=cv2.BORDER_REPLICATE)
+        return torch.from_numpy(sampled), torch.from_numpy(heights)[..., None]
 
     modes: tuple[Interpolation, ...] = ("bilinear", "bicubic")
     resamplers: tuple[Resampler, ...] = ("grid_sample", "opencv")
