@@ -21,6 +21,7 @@ from lsvision.archive.tasks import (
     Work,
     create_depth_store,
     is_finished,
+    remove_partial_chunks,
 )
 from lsvision.io import ProductLayout, create_product, read_scan
 from lsvision.types import Scan
@@ -68,7 +69,9 @@ def scan_job(planned: PlannedScan, place: Place) -> Job:
         measured = sum(strip.measured for strip in place.ledger.done(planned.key, "product", strips_key).values())
         yield [Task(planned.key, FinishProduct(str(product), str(target), strips_key, measured, place.verify))]
     for other in work.iterdir():
-        if other != depth:
+        if other == depth:
+            remove_partial_chunks(other)
+        else:
             shutil.rmtree(other, ignore_errors=True)
     return _last_row(row, planned, place, strips_key)
 

@@ -141,8 +141,7 @@ class FinishProduct:
         remove_left_over(self.target)
         if not Path(self.product).is_dir() and is_finished(self.target, self.key):
             return TaskResult()  # by a worker that died before it could say so
-        for left_over in Path(self.product).rglob("*.partial"):
-            left_over.unlink(missing_ok=True)
+        remove_partial_chunks(self.product)
         if self.verify and (damage := damage_of(self.product, self.measured)):
             return TaskResult(error=damage)
         complete_product(self.product, self.target)
@@ -207,6 +206,12 @@ def create_depth_store(path: Path, lines: int, width: int, strip_lines: int, *, 
             compressors=[ZstdCodec(level=1, checksum=True)],
         )
     partial.rename(path)
+
+
+def remove_partial_chunks(store: Path | str) -> None:
+    """Take away what workers left that were killed while they wrote a chunk; for the only one who uses the store."""
+    for left_over in Path(store).rglob("*.partial"):
+        left_over.unlink(missing_ok=True)
 
 
 def is_finished(target: Path | str, key: str) -> bool:

@@ -100,6 +100,14 @@ def test_what_killed_writers_left_beside_a_product_goes_with_the_next(archive, c
     assert other.exists()
 
 
+def test_what_killed_workers_left_of_depth_goes_with_the_next_run(archive, calibration, undisturbed, tmp_path):
+    shutil.copytree(undisturbed, tmp_path / "o")
+    partial = next((tmp_path / "o" / ".work").rglob("c/0")) / "0.0123.partial"
+    partial.touch()
+    process(archive, make_calibration(tmp_path / "other.json", (-0.01, 1.01, 0.02)), tmp_path / "o")
+    assert not partial.exists()
+
+
 @pytest.mark.parametrize("rows", [16, 512])
 def test_strips_of_any_height_make_the_same_products(archive, calibration, undisturbed, tmp_path, rows):
     process(archive, calibration, tmp_path / "o", processing=with_strip_rows(rows))
