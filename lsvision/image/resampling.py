@@ -110,7 +110,7 @@ class _Axis:
             return None
         if low < -first or high > size - 1 - first:
             position = position.clamp(-first, size - 1 - first)
-            low, high, gaps = _ends(position)
+            low, high = (min(max(end, -first), size - 1 - first) for end in (low, high))
         start, stop = math.floor(low) - _REACH, math.ceil(high) + _REACH + 1
         if stop - start > _LARGEST_WINDOW:
             raise ValueError(f"positions: expected a spread of at most {_LARGEST_WINDOW} px, got {stop - start}")
