@@ -1,6 +1,7 @@
 """The ledger of an output: a row a scan and a row a strip, in SQLite beside the products."""
 
 import sqlite3
+import time
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
@@ -9,6 +10,8 @@ from typing import Literal
 from lsvision.errors import FileFormatError
 
 LEDGER_FILE = "ledger.sqlite"
+
+_WAIT_SECONDS = 5.0
 
 Stage = Literal["disparity", "product"]
 Status = Literal["running", "done", "failed"]
@@ -81,7 +84,7 @@ class Ledger:
         try:
             self._db = sqlite3.connect(path, isolation_level=None)
             self._db.row_factory = sqlite3.Row
-            self._db.execute("PRAGMA journal_mode=WAL")
+            _log_ahead(self._db)
             self._db.execute("PRAGMA synchronous=NORMAL")
             self._db.executescript(_SCHEMA)
         except sqlite3.DatabaseError as error:
@@ -153,3 +156,16 @@ def _upsert(table: str, schema: type) -> str:
     changes = ", ".join(f"{name} = excluded.{name}" for name in names)
     values = ", ".join(f":{name}" for name in names)
     return f"INSERT INTO {table} ({', '.join(names)}) VALUES ({values}) ON CONFLICT DO UPDATE SET {changes}"
+
+
+def _log_ahead(db: sqlite3.Connection) -> None:
+    """Let others read while one writes. Where two ask for that at once, SQLite refuses one instead of waiting."""
+    last = time.monotonic() + _WAIT_SECONDS
+    while True:
+        try:
+            db.execute("PRAGMA journal_mode=WAL")
+            return
+        except sqlite3.OperationalError as error:
+            if error.sqlite_errorcode != sqlite3.SQLITE_BUSY or time.monotonic() > last:
+                raise
+            time.sleep(0.01)

@@ -1,5 +1,7 @@
 """Strips that fit the memory, what a run takes, and the ledger that says what is done."""
 
+import threading
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import pytest
@@ -59,6 +61,19 @@ def test_rows_come_back_and_runs_of_a_strip_are_counted(tmp_path):
         assert ledger.strips()[0].runs == 1
         ledger.forget_strips("ä/1", "product")
         assert not ledger.strips()
+
+
+def test_a_ledger_that_several_open_while_it_is_made(tmp_path):
+    with ThreadPoolExecutor(4) as pool:
+        for number in range(30):
+            together = threading.Barrier(4)
+
+            def scans(path, together=together):
+                together.wait()
+                with Ledger(path) as ledger:
+                    return ledger.scans()
+
+            assert list(pool.map(scans, [tmp_path / f"{number}.sqlite"] * 4)) == [{}] * 4
 
 
 def test_a_ledger_in_words():
