@@ -146,6 +146,14 @@ class Scan:
 
 
 @dataclass(frozen=True)
+class Pose:
+    """Frame of a target in the object's own coordinates: ``p = rotation p_frame + translation``, float64, mm."""
+
+    rotation: Tensor
+    translation: Tensor
+
+
+@dataclass(frozen=True)
 class BoardCorners:
     """The corners of one board in one scan, measured and true.
 
@@ -253,3 +261,32 @@ class Calibration:
     def improvement(self) -> float:
         """Share of the RMSE that the calibration removed, 1 - after / before."""
         return 1.0 - self.rmse_after_mm / self.rmse_before_mm
+
+
+@dataclass(frozen=True)
+class ProductGrid:
+    """Cells of a product: cell (row, column) lies at q_y = origin_y + row·pitch, q_x = origin_x + column·pitch, mm."""
+
+    rows: int
+    columns: int
+    pitch_mm: float
+    origin_y_mm: float
+    origin_x_mm: float
+
+
+@dataclass(frozen=True)
+class ProductStrip:
+    """Consecutive rows of a product.
+
+    ``color (rows, columns, channels)`` in the scan's dtype, ``height (rows, columns)`` float32 mm over the plane of
+    zero disparity, NaN where not measured, ``valid`` where it is, ``source (rows, columns, 2)`` float32 (line, column)
+    that the colour came from, NaN where nothing was seen, ``sigma (rows, columns, 3)`` float32 mm the standard
+    deviations of q_x, q_y and q_z, where they were asked for.
+    """
+
+    row: int
+    color: Tensor
+    height: Tensor
+    valid: Tensor
+    source: Tensor
+    sigma: Tensor | None = None

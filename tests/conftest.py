@@ -1,5 +1,7 @@
 """Shapes are checked while the tests run; every test starts from one seed and one thread."""
 
+import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import hypothesis
@@ -15,6 +17,9 @@ torch.set_num_threads(1)  # before the fixtures of wider scope; xdist's workers 
 # The same examples every time, and no clock: a slow machine is no failure.
 hypothesis.settings.register_profile("seeded", derandomize=True, deadline=None)
 hypothesis.settings.load_profile("seeded")
+
+# Test processes share the processor already; "++" because a run without an experiment has no such option yet.
+ONE_THREAD = ("++threads=1",)
 
 SHARED_DATA = Path(__file__).parents[2] / "shared" / "data"
 
@@ -39,3 +44,21 @@ def rig():
     from lsvision.types import Rig
 
     return Rig(1786, 40.0, 113.84, 354.0, 260.125, 1524.375)
+
+
+@pytest.fixture
+def command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., int]:
+    """Run ``python -m lsvision.run`` in this process with overrides, in a folder of its own; returns the exit code."""
+    from lsvision import run
+
+    monkeypatch.chdir(tmp_path)
+
+    def call(*overrides: str, folder: str = "run") -> int:
+        monkeypatch.setattr(sys, "argv", ["lsvision", *overrides, *ONE_THREAD, f"hydra.run.dir={tmp_path / folder}"])
+        try:
+            run.main()
+        except SystemExit as stop:
+            return int(stop.code or 0)
+        return 0
+
+    return call

@@ -1,9 +1,9 @@
 """Archives of scans: found, planned, worked through in strips on many workers, and booked in a ledger."""
 
-from lsvision.archive.calibrations import DatedCalibration, calibration_for, read_calibrations
-from lsvision.archive.catalogue import Found, find_scans
-from lsvision.archive.engine import Engine, EngineConfig, LocalEngine, worker_count
-from lsvision.archive.jobs import Place, scan_job, verify_job
+from lsvision.archive.driver import run_jobs
+from lsvision.archive.engines.local import LocalEngine
+from lsvision.archive.engines.protocol import Engine, EngineConfig, worker_count
+from lsvision.archive.job import Place, scan_job, verify_job
 from lsvision.archive.ledger import LEDGER_FILE, Ledger, ScanRow, StripRow, ledger_lines
 from lsvision.archive.lock import sole_run
 from lsvision.archive.plan import (
@@ -15,8 +15,9 @@ from lsvision.archive.plan import (
     predicted_seconds,
     product_path,
 )
-from lsvision.archive.remote import local_archive
-from lsvision.archive.run import run_jobs
+from lsvision.archive.sources.calibrations import DatedCalibration, calibration_for, read_calibrations
+from lsvision.archive.sources.catalogue import Found, find_scans
+from lsvision.archive.sources.remote import local_archive
 
 __all__ = [
     "LEDGER_FILE",

@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Any
 
 from lsvision.errors import FileFormatError
-from lsvision.io.checksum import FILE_KEYS
-from lsvision.io.validation import read_yaml
-from lsvision.stages.correction import CorrectionConfig
-from lsvision.stages.disparity import DisparityConfig
+from lsvision.io.formats.checksum import FILE_KEYS
+from lsvision.io.formats.validation import read_yaml
+from lsvision.stages.correction.config import CorrectionConfig
+from lsvision.stages.disparity.config import DisparityConfig
 
 
 def stamp_of(folder: Path) -> str:

@@ -6,15 +6,17 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from lsvision import __version__
-from lsvision.archive.calibrations import DatedCalibration, calibration_for
-from lsvision.archive.catalogue import Found
 from lsvision.archive.identity import key_of, stamp_of
 from lsvision.archive.ledger import ScanRow
+from lsvision.archive.sources.calibrations import DatedCalibration, calibration_for
+from lsvision.archive.sources.catalogue import Found
 from lsvision.errors import FileFormatError, LsvisionError
 from lsvision.io import read_scan
-from lsvision.stages.correction import CorrectionConfig, ProductGrid, plan_product
-from lsvision.stages.disparity import DisparityConfig, disparity_range
-from lsvision.types import Scan
+from lsvision.stages.correction.config import CorrectionConfig
+from lsvision.stages.correction.grid import plan_product
+from lsvision.stages.disparity.config import DisparityConfig
+from lsvision.stages.disparity.match import disparity_range
+from lsvision.types import ProductGrid, Scan
 
 # Peak of a worker over an idle one, as measured; an idle one holds torch, OpenCV and the decoded ends of its files.
 IDLE_BYTES = 500 * 2**20

@@ -31,8 +31,11 @@ from lsvision.io import (
     remove_left_over,
     scan_sha256,
 )
-from lsvision.stages.correction import CorrectionConfig, correct_rows, plan_product
-from lsvision.stages.disparity import DisparityConfig, MatchedDepth
+from lsvision.stages.correction.config import CorrectionConfig
+from lsvision.stages.correction.correct import correct_rows
+from lsvision.stages.correction.grid import plan_product
+from lsvision.stages.disparity.config import DisparityConfig
+from lsvision.stages.disparity.depth import MatchedDepth
 from lsvision.types import LineImage, Motion, Scan
 
 # The arrays of the working store.

@@ -8,12 +8,14 @@ from pathlib import Path
 
 from lsvision import __version__
 from lsvision.errors import CalibrationError, ConfigError
-from lsvision.experiments.progress import progress_bars
 from lsvision.experiments.settings import RunSettings, settings_sha256
 from lsvision.io import read_scan, scan_sha256, write_calibration, write_text
 from lsvision.report import calibration_report, calibration_summary
-from lsvision.stages.calibration import CalibrationConfig, calibrate
-from lsvision.stages.corners import CornersConfig, find_corners
+from lsvision.report.progress import progress_bars
+from lsvision.stages.calibration.calibrate import calibrate
+from lsvision.stages.calibration.config import CalibrationConfig
+from lsvision.stages.corners.config import CornersConfig
+from lsvision.stages.corners.find import find_corners
 from lsvision.types import Board, BoardCorners, Calibration, Provenance, Scan
 
 log = logging.getLogger(__name__)

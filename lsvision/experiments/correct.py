@@ -6,7 +6,6 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 from lsvision import __version__
-from lsvision.experiments.progress import ProgressBars, progress_bars
 from lsvision.experiments.settings import RunSettings, settings_sha256
 from lsvision.image.tiling import keep_freed_memory
 from lsvision.io import (
@@ -21,10 +20,14 @@ from lsvision.io import (
     write_text,
 )
 from lsvision.report import product_report
-from lsvision.stages.correction import CorrectionConfig, ProductGrid, correct_scan, plan_product
-from lsvision.stages.disparity import DisparityConfig, depth_of
-from lsvision.stages.uncertainty import drift_per_metre, sigma_of
-from lsvision.types import Motion, Scan
+from lsvision.report.progress import ProgressBars, progress_bars
+from lsvision.stages.correction.config import CorrectionConfig
+from lsvision.stages.correction.correct import correct_scan
+from lsvision.stages.correction.grid import plan_product
+from lsvision.stages.correction.uncertainty import drift_per_metre, sigma_of
+from lsvision.stages.disparity.config import DisparityConfig
+from lsvision.stages.disparity.depth import depth_of
+from lsvision.types import Motion, ProductGrid, Scan
 
 log = logging.getLogger(__name__)
 

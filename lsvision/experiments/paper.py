@@ -10,33 +10,26 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 from lsvision.experiments.correct import write_product
-from lsvision.experiments.paper_pages import PAPER, BoardCheck, Scenario, write_paper_report
 from lsvision.experiments.parallel import scan_pool
-from lsvision.experiments.progress import ProgressBars, progress_bars
 from lsvision.experiments.settings import RunSettings
-from lsvision.experiments.sheet import points_in_product, points_in_scan
 from lsvision.experiments.simulate import write_simulation
 from lsvision.geometry import displace
 from lsvision.io import Product, read_product, read_scan, write_calibration, write_text
-from lsvision.simulation import MotionConfig, SceneConfig, SensorConfig, Simulation, scaled_rig, simulate
-from lsvision.stages.calibration import CalibrationConfig, calibrate
-from lsvision.stages.corners import CornersConfig, find_corners
-from lsvision.stages.correction import CorrectionConfig, ProductGrid
-from lsvision.stages.disparity import DisparityConfig, depth_of
+from lsvision.report.paper_pages import PAPER, BoardCheck, Scenario, write_paper_report
+from lsvision.report.progress import ProgressBars, progress_bars
+from lsvision.simulation import BoardPose, MotionConfig, SceneConfig, SensorConfig, Simulation, scaled_rig, simulate
+from lsvision.simulation.sheet_points import points_in_product, points_in_scan
+from lsvision.stages.calibration.calibrate import calibrate
+from lsvision.stages.calibration.config import CalibrationConfig
+from lsvision.stages.corners.config import CornersConfig
+from lsvision.stages.corners.find import find_corners
+from lsvision.stages.correction.config import CorrectionConfig
+from lsvision.stages.disparity.config import DisparityConfig
+from lsvision.stages.disparity.depth import depth_of
 from lsvision.stages.measurement import distance_errors, measure_board
-from lsvision.types import Board, BoardCorners, Rig, Scan, TensorImage
+from lsvision.types import Board, BoardCorners, ProductGrid, Rig, Scan, TensorImage
 
 log = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True)
-class BoardPose:
-    """One placing of the board under the cameras."""
-
-    pitch_deg: float
-    roll_deg: float
-    yaw_deg: float
-    depth_offset_mm: float = 0.0
 
 
 @dataclass(frozen=True, kw_only=True)

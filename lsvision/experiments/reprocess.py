@@ -29,14 +29,14 @@ from lsvision.archive import (
     verify_job,
     worker_count,
 )
-from lsvision.archive.jobs import WORK_FOLDER, Job
+from lsvision.archive.job import WORK_FOLDER, Job
 from lsvision.archive.tasks import Task, TaskResult
 from lsvision.errors import ConfigError, ScansFailedError
-from lsvision.experiments.progress import progress_bars
-from lsvision.experiments.reprocess_pages import reprocess_report
 from lsvision.experiments.settings import RunSettings
-from lsvision.stages.correction import CorrectionConfig
-from lsvision.stages.disparity import DisparityConfig
+from lsvision.report.archive_pages import reprocess_report
+from lsvision.report.progress import progress_bars
+from lsvision.stages.correction.config import CorrectionConfig
+from lsvision.stages.disparity.config import DisparityConfig
 
 log = logging.getLogger(__name__)
 
@@ -168,7 +168,7 @@ def _engine(config: EngineConfig) -> Engine:
     if config.kind == "local":
         return LocalEngine(worker_count(config))
     try:
-        from lsvision.archive.dask_engine import DaskEngine
+        from lsvision.archive.engines.dask import DaskEngine
     except ModuleNotFoundError as error:
         raise ConfigError(f"engine=dask needs the extra 'cluster': pip install 'lsvision[cluster]' ({error})") from None
     engine = DaskEngine(config.scheduler, worker_count(config), config.worker_memory_mb)

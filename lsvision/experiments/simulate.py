@@ -9,9 +9,9 @@ import torch
 from torch import Tensor
 
 from lsvision.errors import ConfigError
-from lsvision.experiments.progress import ProgressBars, progress_bars
 from lsvision.experiments.settings import RunSettings
 from lsvision.io import write_scan
+from lsvision.report.progress import ProgressBars, progress_bars
 from lsvision.simulation import (
     EncoderConfig,
     MotionConfig,

@@ -8,16 +8,16 @@ from pathlib import Path
 import polars
 
 from lsvision.errors import ConfigError
-from lsvision.experiments.paper import BoardPose
 from lsvision.experiments.settings import RunSettings
-from lsvision.experiments.study_map import tilt_map
-from lsvision.experiments.study_points import Conditions, exact_corners, study_points
-from lsvision.experiments.study_runs import run_points
-from lsvision.experiments.study_tables import iterations_table, points_table, runs_table
 from lsvision.io import write_text
 from lsvision.io.atomic import partial_file
 from lsvision.report import Study, study_report
-from lsvision.stages.calibration import CalibrationConfig
+from lsvision.simulation import BoardPose
+from lsvision.stages.calibration.config import CalibrationConfig
+from lsvision.study.map import tilt_map
+from lsvision.study.points import Conditions, exact_corners, study_points
+from lsvision.study.runs import run_points
+from lsvision.study.tables import iterations_table, points_table, runs_table
 from lsvision.types import Board, Rig
 
 log = logging.getLogger(__name__)

@@ -11,9 +11,8 @@ from torch import Tensor
 
 from lsvision.experiments.settings import RunSettings
 from lsvision.io import Product, check_product, read_product, write_text
-from lsvision.stages.correction import ProductGrid
 from lsvision.stages.measurement import measure_board
-from lsvision.types import Board
+from lsvision.types import Board, ProductGrid
 
 log = logging.getLogger(__name__)
 

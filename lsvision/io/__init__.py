@@ -1,19 +1,19 @@
 """Files: rig, scan, calibration and product; read by line ranges, checked on reading, complete under a final name."""
 
 from lsvision.io.atomic import remove_left_over, write_text
-from lsvision.io.calibration import check_rig_match, read_calibration, write_calibration
-from lsvision.io.checksum import scan_sha256
-from lsvision.io.encoder import read_encoder, write_encoder
-from lsvision.io.export import ExportFormat, export_product
-from lsvision.io.las import write_laz
-from lsvision.io.line_image import open_line_image
-from lsvision.io.ply import write_ply
-from lsvision.io.product import Product, read_product
-from lsvision.io.product_check import ProductCheck, check_product
-from lsvision.io.product_writer import ProductLayout, ProductRows, ProductWriter, complete_product, create_product
-from lsvision.io.rig import read_rig, rig_from_dict, rig_to_dict, write_rig
-from lsvision.io.scan import read_scan, write_scan
-from lsvision.io.tiff import write_line_image
+from lsvision.io.formats.calibration import check_rig_match, read_calibration, write_calibration
+from lsvision.io.formats.checksum import scan_sha256
+from lsvision.io.formats.encoder import read_encoder, write_encoder
+from lsvision.io.formats.rig import read_rig, rig_from_dict, rig_to_dict, write_rig
+from lsvision.io.formats.scan import read_scan, write_scan
+from lsvision.io.images.line_image import open_line_image
+from lsvision.io.images.tiff import write_line_image
+from lsvision.io.product.check import ProductCheck, check_product
+from lsvision.io.product.export import ExportFormat, export_product
+from lsvision.io.product.las import write_laz
+from lsvision.io.product.ply import write_ply
+from lsvision.io.product.reader import Product, read_product
+from lsvision.io.product.writer import ProductLayout, ProductRows, ProductWriter, complete_product, create_product
 
 __all__ = [
     "ExportFormat",

@@ -1,11 +1,12 @@
 """Line-scan renderer: boards, sheets and rails under a stereo rig, with their motion and its truth."""
 
 from lsvision.simulation.artwork import artwork
-from lsvision.simulation.config import EncoderConfig, MotionConfig, SceneConfig, SensorConfig
+from lsvision.simulation.config import BoardPose, EncoderConfig, MotionConfig, SceneConfig, SensorConfig
 from lsvision.simulation.scan import Simulation, scaled_rig, simulate
 from lsvision.simulation.trajectory import Trajectory
 
 __all__ = [
+    "BoardPose",
     "EncoderConfig",
     "MotionConfig",
     "SceneConfig",

@@ -80,3 +80,13 @@ class EncoderConfig:
     wobble_wavelengths_mm: list[float] = field(default_factory=lambda: [390.0, 151.0])
     noise_mm: float = 0.002
     seed: int = 0
+
+
+@dataclass(frozen=True)
+class BoardPose:
+    """One placing of the board under the cameras."""
+
+    pitch_deg: float
+    roll_deg: float
+    yaw_deg: float
+    depth_offset_mm: float = 0.0

@@ -6,14 +6,7 @@ import torch
 from torch import Tensor
 
 from lsvision.simulation.trajectory import Rays
-
-
-@dataclass(frozen=True)
-class Pose:
-    """Frame of a target in the object's own coordinates: ``p = rotation p_frame + translation``, float64, mm."""
-
-    rotation: Tensor
-    translation: Tensor
+from lsvision.types import Pose
 
 
 @dataclass(frozen=True)

@@ -13,10 +13,10 @@ from lsvision.simulation.config import SceneConfig
 from lsvision.simulation.defects import defects
 from lsvision.simulation.lighting import Lighting
 from lsvision.simulation.noise import Nodes, Octave, Raster, covering, octaves, value_noise
-from lsvision.simulation.plane import Pose
 from lsvision.simulation.rail_profile import Hit, first_hit, head_60e1, slopes_from
 from lsvision.simulation.surfaces import Conveyor, Look, tinted
 from lsvision.simulation.trajectory import Rays
+from lsvision.types import Pose
 
 _TINT = (0.47, 0.44, 0.41)
 # Mill scale is isotropic; rolling draws streaks along the rail. Cells in nodes, (around, along).

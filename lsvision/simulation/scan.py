@@ -14,12 +14,11 @@ from lsvision.errors import ConfigError
 from lsvision.geometry import project
 from lsvision.simulation.config import EncoderConfig, MotionConfig, SceneConfig, SensorConfig
 from lsvision.simulation.noise import lattice_hash
-from lsvision.simulation.plane import Pose
 from lsvision.simulation.scene import build_scene, place, scene_lines
 from lsvision.simulation.sensor import expose, halo_px, integrate, sample_offsets
 from lsvision.simulation.surfaces import Look, Scene
 from lsvision.simulation.trajectory import Trajectory, cast_rays
-from lsvision.types import Board, Rig, Transport, Travel
+from lsvision.types import Board, Pose, Rig, Transport, Travel
 
 Camera = Literal["left", "right"]
 

@@ -8,10 +8,9 @@ from torch import Tensor
 from lsvision.geometry import product_axes, rotation_from_vector
 from lsvision.simulation.config import SceneConfig
 from lsvision.simulation.lighting import line_lights
-from lsvision.simulation.plane import Pose
 from lsvision.simulation.rail import RailScene
 from lsvision.simulation.surfaces import BoardScene, Conveyor, Scene, SheetScene, board_extent
-from lsvision.types import Board, Rig
+from lsvision.types import Board, Pose, Rig
 
 
 def place(rig: Rig, board: Board, scene: SceneConfig, n: Tensor, middle_mm: float) -> Pose:

@@ -11,9 +11,9 @@ from lsvision.simulation.artwork import sheet_raster
 from lsvision.simulation.config import SceneConfig
 from lsvision.simulation.lighting import Lighting
 from lsvision.simulation.noise import Raster, covering, octaves, value_noise
-from lsvision.simulation.plane import PlaneView, Pose, coverage, footprint, square_wave, view_plane
+from lsvision.simulation.plane import PlaneView, coverage, footprint, square_wave, view_plane
 from lsvision.simulation.trajectory import Rays
-from lsvision.types import Board
+from lsvision.types import Board, Pose
 
 _INK = 0.05  # reflectance of a black square, of a white one's
 _BOARD_TINT = (0.84, 0.82, 0.79)

@@ -5,10 +5,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from lsvision.image.checkerboard import detect_board
+from lsvision.image.board.detect import detect_board
 from lsvision.image.planes import fit_local_planes
-from lsvision.stages.correction import ProductGrid
-from lsvision.types import Board, LineImage
+from lsvision.types import Board, LineImage, ProductGrid
 
 
 @dataclass(frozen=True)

@@ -11,8 +11,8 @@ import cv2
 import torch
 from torch import Tensor
 
+from lsvision.image.board.detect import detect_board, order_grid
 from lsvision.image.brightness import gray
-from lsvision.image.checkerboard import detect_board, order_grid
 from lsvision.simulation import MotionConfig, SceneConfig, SensorConfig, simulate
 from lsvision.types import Board, Rig, TensorImage
 

@@ -13,7 +13,8 @@ from torch import Tensor
 
 from lsvision.image.tiling import keep_freed_memory
 from lsvision.simulation import MotionConfig, SceneConfig, SensorConfig, simulate
-from lsvision.stages.disparity import DisparityConfig, StripMatch, measure_strip
+from lsvision.stages.disparity.config import DisparityConfig
+from lsvision.stages.disparity.match import StripMatch, measure_strip
 from lsvision.types import Board, Rig
 
 RIG = Rig(7142, 10.0, 113.84, 354.0, 1042.0, 6099.0)

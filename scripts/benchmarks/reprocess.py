@@ -28,12 +28,15 @@ from lsvision.archive import (
     run_jobs,
     scan_job,
 )
-from lsvision.archive.dask_engine import DaskEngine
+from lsvision.archive.engines.dask import DaskEngine
 from lsvision.archive.tasks import Task, TaskResult
 from lsvision.image.tiling import keep_freed_memory
 from lsvision.io import ProductLayout, ProductWriter, read_calibration, read_scan, write_calibration, write_scan
-from lsvision.stages.correction import CorrectionConfig, correct_scan, plan_product
-from lsvision.stages.disparity import DisparityConfig, depth_of
+from lsvision.stages.correction.config import CorrectionConfig
+from lsvision.stages.correction.correct import correct_scan
+from lsvision.stages.correction.grid import plan_product
+from lsvision.stages.disparity.config import DisparityConfig
+from lsvision.stages.disparity.depth import depth_of
 from lsvision.types import Calibration, Motion, Observability, Rig, Travel
 
 RIG = Rig(1786, 40.0, 113.84, 354.0, 260.125, 1524.375)

@@ -22,8 +22,12 @@ from torch import Tensor
 from lsvision.image.brightness import gray_bytes
 from lsvision.image.resampling import SAMPLED_TILES, Interpolation, Resampler, sample_images
 from lsvision.image.tiling import in_parallel, keep_freed_memory, tiles
-from lsvision.stages.correction import CorrectionConfig, correct_rows, correct_scan, plan_product
-from lsvision.stages.disparity import DisparityConfig, MatchedDepth, depth_of, disparity_range
+from lsvision.stages.correction.config import CorrectionConfig
+from lsvision.stages.correction.correct import correct_rows, correct_scan
+from lsvision.stages.correction.grid import plan_product
+from lsvision.stages.disparity.config import DisparityConfig
+from lsvision.stages.disparity.depth import MatchedDepth, depth_of
+from lsvision.stages.disparity.match import disparity_range
 from lsvision.types import Motion, Rig, Scan, Travel
 
 RIG = Rig(7142, 10.0, 113.84, 354.0, 1042.0, 6099.0)

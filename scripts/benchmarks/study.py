@@ -17,9 +17,9 @@ from scipy.spatial.transform import Rotation
 
 from lsvision.experiments.settings import build_settings
 from lsvision.experiments.study import StudySettings
-from lsvision.experiments.study_points import exact_corners, noise_chol
-from lsvision.experiments.study_runs import noisy_points, run_points
 from lsvision.run import config_folder
+from lsvision.study.points import exact_corners, noise_chol
+from lsvision.study.runs import noisy_points, run_points
 
 RUNS, PEER_RUNS, TURNS, THREADS = 2048, 96, 7, 2
 

@@ -21,8 +21,8 @@ from lsvision.archive import (
     scan_job,
 )
 from lsvision.io import read_product, write_calibration, write_scan
-from lsvision.stages.correction import CorrectionConfig
-from lsvision.stages.disparity import DisparityConfig
+from lsvision.stages.correction.config import CorrectionConfig
+from lsvision.stages.disparity.config import DisparityConfig
 from lsvision.types import Calibration, Motion, Observability, Rig, Travel
 
 WIDTH = 64

@@ -11,9 +11,8 @@ from lsvision.experiments import EXPERIMENTS
 from lsvision.experiments.settings import build_settings
 from lsvision.io import read_calibration, read_product, read_scan
 from lsvision.run import config_folder
-from lsvision.stages.correction import ProductGrid
 from lsvision.stages.measurement import measure_board
-from lsvision.types import Board, TensorImage
+from lsvision.types import Board, ProductGrid, TensorImage
 
 TILTS = {"a": (2.0, 1.5, 0.0), "b": (-5.0, 1.0, 6.0), "c": (4.0, -3.0, -8.0)}
 

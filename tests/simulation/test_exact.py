@@ -8,8 +8,7 @@ import pytest
 import torch
 
 from lsvision.simulation import EncoderConfig, MotionConfig, SceneConfig, SensorConfig, scaled_rig, simulate
-from lsvision.simulation.plane import Pose
-from lsvision.types import Rig
+from lsvision.types import Pose, Rig
 from tests.simulation.corner_fit import fit_corners
 
 SHARED_N = MotionConfig(angle_x_deg=-1.5, angle_z_deg=0.8, stretch=0.985)

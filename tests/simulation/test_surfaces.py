@@ -10,9 +10,10 @@ from lsvision.simulation import EncoderConfig, MotionConfig, SceneConfig, Sensor
 from lsvision.simulation.defects import defects
 from lsvision.simulation.lighting import line_lights
 from lsvision.simulation.noise import Nodes
-from lsvision.simulation.plane import Pose, coverage, footprint, square_wave, view_plane
+from lsvision.simulation.plane import coverage, footprint, square_wave, view_plane
 from lsvision.simulation.sensor import expose, halo_px, integrate, sample_offsets
 from lsvision.simulation.trajectory import cast_rays
+from lsvision.types import Pose
 
 SHAKEN = MotionConfig(-1.5, 0.8, 1.0246, vibration_x_mm=0.7, vibration_z_mm=0.4, vibration_roll_deg=0.3)
 

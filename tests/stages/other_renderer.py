@@ -9,7 +9,7 @@ from torch import Tensor
 
 from lsvision.geometry import scan_position, transform
 from lsvision.io import read_scan
-from lsvision.stages.corners import find_corners
+from lsvision.stages.corners.find import find_corners
 from lsvision.types import BoardCorners, Scan
 from tests.stages.rendered import BOARD
 

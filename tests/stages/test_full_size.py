@@ -4,9 +4,10 @@ import cv2
 import pytest
 import torch
 
-from lsvision.image.checkerboard import detect_board
+from lsvision.image.board.detect import detect_board
 from lsvision.simulation import MotionConfig, SceneConfig, SensorConfig, simulate
-from lsvision.stages.disparity import DisparityConfig, StripMatch, measure_strip
+from lsvision.stages.disparity.config import DisparityConfig
+from lsvision.stages.disparity.match import StripMatch, measure_strip
 from lsvision.types import TensorImage
 from tests.stages.rendered import BOARD, FULL_RIG
 

@@ -5,9 +5,13 @@ from pathlib import Path
 import pytest
 import torch
 
-from lsvision.stages.calibration import CalibrationConfig, calibrate
-from lsvision.stages.correction import CorrectionConfig, correct_scan, plan_product
-from lsvision.stages.disparity import DisparityConfig, depth_of
+from lsvision.stages.calibration.calibrate import calibrate
+from lsvision.stages.calibration.config import CalibrationConfig
+from lsvision.stages.correction.config import CorrectionConfig
+from lsvision.stages.correction.correct import correct_scan
+from lsvision.stages.correction.grid import plan_product
+from lsvision.stages.disparity.config import DisparityConfig
+from lsvision.stages.disparity.depth import depth_of
 from lsvision.stages.measurement import BoardMeasurement, distance_errors, measure_board
 from lsvision.types import Board, LineImage, Motion, Scan, TensorImage
 from tests.stages.other_renderer import tilt_corners, tilt_scans, true_motion

@@ -9,7 +9,9 @@ from torch import Tensor
 
 from lsvision.errors import FileFormatError
 from lsvision.io import read_encoder
-from lsvision.stages.correction import CorrectionConfig, correct_scan, plan_product
+from lsvision.stages.correction.config import CorrectionConfig
+from lsvision.stages.correction.correct import correct_scan
+from lsvision.stages.correction.grid import plan_product
 from lsvision.types import Motion, Rig, Scan, TensorImage, Travel
 
 PITCH = 0.56

@@ -1,0 +1,1 @@
+"""Where the scans of an archive and their calibrations come from."""

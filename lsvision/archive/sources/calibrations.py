@@ -1,0 +1,105 @@
+"""Which calibration belongs to a scan: one for all, or by rig and date."""
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import date
+from pathlib import Path
+
+from lsvision.errors import CalibrationError, FileFormatError
+from lsvision.io import check_rig_match, read_calibration
+from lsvision.io.formats.validation import Fields, read_yaml
+from lsvision.types import Calibration, Scan
+
+LIST_FILE = "calibrations.yaml"
+
+
+@dataclass(frozen=True)
+class DatedCalibration:
+    """A calibration, the hash of its file, and the days it holds for, both included; None is open."""
+
+    path: Path
+    calibration: Calibration
+    sha256: str
+    first: date | None = None
+    last: date | None = None
+
+    def holds_on(self, day: date) -> bool:
+        """Whether a day lies within the days it holds for."""
+        return (self.first is None or self.first <= day) and (self.last is None or day <= self.last)
+
+
+def read_calibrations(path: Path | str) -> list[DatedCalibration]:
+    """Read one calibration, or a folder of them.
+
+    A folder holds ``calibrations.yaml``, a list of ``{file: NAME, from: DAY, to: DAY}`` with either day optional, or
+    simply one calibration a rig as ``*.json``.
+
+    Raises:
+        FileFormatError: a file is missing or damaged, or a folder holds none.
+    """
+    path = Path(path)
+    if not path.is_dir():
+        return [_read(path)]
+    if (path / LIST_FILE).is_file():
+        listed = read_yaml(path / LIST_FILE)
+        if not isinstance(listed, list) or not listed:
+            raise FileFormatError(path / LIST_FILE, "expected a list of calibrations")
+        return [_read_listed(Fields(path / LIST_FILE, item, f"[{index}].")) for index, item in enumerate(listed)]
+    files = sorted(path.glob("*.json"))
+    if not files:
+        raise FileFormatError(path, f"expected {LIST_FILE} or calibrations as *.json")
+    return [_read(file) for file in files]
+
+
+def calibration_for(scan: Scan, calibrations: Sequence[DatedCalibration]) -> DatedCalibration:
+    """The one calibration for a scan: made with its rig, and holding on its day where there are several.
+
+    The day is the scan's attribute ``date``, as 2024-05-31 or with a time behind it.
+
+    Raises:
+        CalibrationError: none fits, or more than one does.
+    """
+    if len(calibrations) == 1 and calibrations[0].first is None and calibrations[0].last is None:
+        check_rig_match(calibrations[0].calibration, scan)
+        return calibrations[0]
+    same_rig = [item for item in calibrations if item.calibration.rig == scan.rig]
+    if not same_rig:
+        raise CalibrationError(f"{scan.path}: no calibration for its rig among {len(calibrations)}")
+    if len(same_rig) == 1 and same_rig[0].first is None and same_rig[0].last is None:
+        return same_rig[0]
+    day = _day_of(scan)
+    fitting = [item for item in same_rig if item.holds_on(day)]
+    if len(fitting) != 1:
+        names = ", ".join(item.path.name for item in fitting)
+        raise CalibrationError(
+            f"{scan.path}: {f'several calibrations hold on {day}: {names}' if fitting else f'no calibration for {day}'}"
+        )
+    return fitting[0]
+
+
+def _day_of(scan: Scan) -> date:
+    text = scan.attributes.get("date")
+    if text is None:
+        raise CalibrationError(f"{scan.path}: no calibration: its attributes give no date to choose one by")
+    try:
+        return date.fromisoformat(text[:10])
+    except ValueError:
+        raise CalibrationError(f"{scan.path}: no calibration: expected a date as 2024-05-31, got {text!r}") from None
+
+
+def _read(path: Path, first: date | None = None, last: date | None = None) -> DatedCalibration:
+    calibration = read_calibration(path)
+    return DatedCalibration(path, calibration, hashlib.sha256(path.read_bytes()).hexdigest(), first, last)
+
+
+def _read_listed(fields: Fields) -> DatedCalibration:
+    days = []
+    for key in ("from", "to"):
+        value = fields.take(key) if fields.has(key) else None
+        if value is not None and (not isinstance(value, date) or hasattr(value, "hour")):
+            raise fields.error(key, f"expected a day as 2024-05-31, got {value!r}")
+        days.append(value)
+    file = fields.file("file")
+    fields.finish()
+    return _read(file, *days)

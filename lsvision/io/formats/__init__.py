@@ -1,0 +1,1 @@
+"""The files of lsvision as plain data: rig, scan, encoder log and calibration."""

@@ -1,0 +1,141 @@
+"""The encoder log of a scan: a measured position for every line."""
+
+import csv
+import io
+import logging
+from bisect import bisect_left
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from numpy.typing import NDArray
+from torch import Tensor
+
+from lsvision.errors import FileFormatError
+from lsvision.io.atomic import write_text
+from lsvision.io.formats.validation import read_text
+
+HEADER = ["line", "position_mm"]
+
+# A gap over which the object moved by less than this part of its usual advance was a halt, not a few lost readings.
+_STANDSTILL = 0.5
+_CLOSE = 1e-6  # part of the way to the next good reading that lines of a halt are spread over
+
+logger = logging.getLogger(__name__)
+
+
+def read_encoder(path: Path | str, lines: int, *, repair: bool = False) -> Float[Tensor, " lines"]:
+    """Positions, mm, of the first ``lines`` lines of a log with the header ``line,position_mm``.
+
+    Args:
+        repair: interpolate lines that are missing or break the increase, and log a warning, instead of raising.
+
+    Raises:
+        FileFormatError: not such a log, shorter than the scan, or with faults that are not, or cannot be, repaired.
+    """
+    path = Path(path)
+    line, position = _parse(path)
+    line, position = line[line < lines], position[line < lines]
+    if lines - 1 not in line:
+        last = f"ends at line {line.max()}" if line.size else "is empty"
+        raise FileFormatError(path, f"the log {last}, the scan has {lines} lines")
+    faults = _faults(line, position, lines)
+    if not faults:
+        return torch.from_numpy(position)
+    if not repair:
+        raise FileFormatError(path, f"{faults}; repair was not asked for")
+    repaired = _repaired(path, line, position, lines)
+    logger.warning("%s: repaired by interpolation: %s", path, faults)
+    return torch.from_numpy(repaired)
+
+
+def write_encoder(positions_mm: Float[Tensor, " lines"], path: Path | str) -> None:
+    """Write a log, one line of the scan a row."""
+    rows = "".join(f"{line},{position!r}\n" for line, position in enumerate(positions_mm.double().tolist()))
+    write_text(path, ",".join(HEADER) + "\n" + rows)
+
+
+def _parse(path: Path) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Line numbers, sorted, and positions of all rows."""
+    text = read_text(path)
+    header = next(csv.reader(io.StringIO(text), skipinitialspace=True), [])
+    if [name.strip() for name in header] != HEADER:
+        raise FileFormatError(path, f"expected the header {','.join(HEADER)}, got {','.join(header)[:60]!r}")
+    body = text.split("\n", 1)[1] if "\n" in text else ""
+    if not body.strip():
+        return np.empty(0, np.int64), np.empty(0)
+    try:
+        table = np.loadtxt(io.StringIO(body), delimiter=",", ndmin=2)
+    except ValueError as error:
+        raise FileFormatError(path, f"expected numbers in two columns: {error}") from error
+    if table.shape[1] != 2:
+        raise FileFormatError(path, f"expected two columns, got {table.shape[1]}")
+    if not np.isfinite(table).all() or (table[:, 0] < 0).any() or (table[:, 0] % 1 != 0).any():
+        row = int(np.argmin(np.isfinite(table).all(1) & (table[:, 0] >= 0) & (table[:, 0] % 1 == 0)))
+        raise FileFormatError(path, f"row {row + 2}: expected a line number and a finite position")
+    table = table[np.argsort(table[:, 0], kind="stable")]
+    return table[:, 0].astype(np.int64), np.ascontiguousarray(table[:, 1])
+
+
+def _faults(line: NDArray[np.int64], position: NDArray[np.float64], lines: int) -> str:
+    """What is wrong with a log, in words; empty where nothing is."""
+    again = np.append(False, line[1:] == line[:-1])
+    kept, advance = line[~again], np.diff(position[~again])
+    faults = {
+        "missing": np.setdiff1d(np.arange(lines), kept),
+        "repeated": np.unique(line[again]),
+        "not beyond the line before": kept[1:][advance <= 0],
+    }
+    return "; ".join(f"{_listed(found)} {kind}" for kind, found in faults.items() if found.size)
+
+
+def _listed(lines: NDArray[np.int64]) -> str:
+    shown = ", ".join(map(str, lines[:5].tolist()))
+    return f"line {shown}" if lines.size == 1 else f"{lines.size} lines ({shown}{', ...' if lines.size > 5 else ''})"
+
+
+def _repaired(path: Path, line: NDArray[np.int64], position: NDArray[np.float64], lines: int) -> NDArray[np.float64]:
+    """Positions with every line outside the longest increasing run of readings interpolated.
+
+    Where the object stood or went back, the lines in between saw it again where it had been already: they are put
+    close together beside a good reading, so that no part of the object is taken from them.
+    """
+    first = np.append(True, line[1:] != line[:-1])
+    line, position = line[first], position[first]
+    good = _longest_increasing(position)
+    step = np.diff(position[good], prepend=-np.inf)
+    good = good[step > _CLOSE * np.median(step[1:])] if len(good) > 1 else good  # rounding is no progress
+    if line[good[0]] != 0 or line[good[-1]] != lines - 1:
+        raise FileFormatError(path, "cannot be repaired: the first or the last line has no good reading")
+    elapsed, advance = np.diff(line[good]), np.diff(position[good])
+    stood = (elapsed > 1) & (advance < _STANDSTILL * np.median(advance / elapsed) * elapsed)
+    before, after, advance = good[:-1][stood], good[1:][stood], advance[stood]
+    # Beside the good reading that the object was nearer to when it came to the other.
+    early = np.abs(position[after - 1] - position[before]) <= np.abs(position[before + 1] - position[after])
+    knots = np.where(early, line[after] - 1, line[before] + 1)
+    values = np.where(early, position[before] + _CLOSE * advance, position[after] - _CLOSE * advance)
+    knots, values = np.append(line[good], knots), np.append(position[good], values)
+    order = np.argsort(knots)
+    return np.interp(np.arange(lines), knots[order], values[order])
+
+
+def _longest_increasing(values: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Indices of the longest strictly increasing subsequence: what a single wrong reading, however far off, spares.
+
+    Inherently sequential, and run only on logs that are known to be faulty.
+
+    Source: Fredman 1975, On computing the length of longest increasing subsequences.
+    """
+    tails: list[float] = []
+    tail_index: list[int] = []
+    before = np.full(len(values), -1, np.int64)
+    for index, value in enumerate(values.tolist()):
+        length = bisect_left(tails, value)
+        tails[length : length + 1] = [value]
+        tail_index[length : length + 1] = [index]
+        before[index] = tail_index[length - 1] if length else -1
+    chain = [tail_index[-1]]
+    while before[chain[-1]] >= 0:
+        chain.append(int(before[chain[-1]]))
+    return np.array(chain[::-1])

@@ -1,0 +1,1 @@
+"""Tall images read by line ranges: TIFF, Zarr arrays, folders of frames."""

@@ -1,0 +1,33 @@
+"""Opening a tall image, whatever holds it."""
+
+from pathlib import Path
+
+from lsvision.errors import FileFormatError
+from lsvision.io.images.bands import BandedImage
+from lsvision.io.images.frames import FrameBands
+from lsvision.io.images.tiff import TiffBands
+from lsvision.io.images.zarr_array import ZarrBands, is_zarr
+from lsvision.types import LineImage
+
+_TIFF_MAGIC = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
+
+
+def open_line_image(path: Path | str) -> LineImage:
+    """Open a TIFF or BigTIFF, a Zarr array, or a folder of frames to be read by line ranges.
+
+    The image decodes the file's own strips, tiles, chunks or frames that a range touches, and keeps the latest, so that
+    reading onwards with an overlap decodes each about once. It holds no open file and pickles as its path.
+
+    Raises:
+        FileFormatError: nothing there, another kind of file, or one that is damaged or cut short.
+    """
+    path = Path(path)
+    if path.is_dir():
+        return BandedImage(ZarrBands(path) if is_zarr(path) else FrameBands(path))
+    if not path.is_file():
+        raise FileFormatError(path, "no such image")
+    with path.open("rb") as file:
+        magic = file.read(4)
+    if magic not in _TIFF_MAGIC:
+        raise FileFormatError(path, "expected a TIFF, a Zarr array or a folder of frames")
+    return BandedImage(TiffBands(path))

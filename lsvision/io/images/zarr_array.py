@@ -1,0 +1,46 @@
+"""A Zarr array (format 2 or 3) as a tall image."""
+
+from pathlib import Path
+
+import numpy as np
+import zarr
+from numpy.typing import NDArray
+
+from lsvision.errors import FileFormatError
+from lsvision.io.images.bands import even_edges
+
+_METADATA_FILES = ("zarr.json", ".zarray", ".zgroup")
+
+
+def is_zarr(path: Path) -> bool:
+    """Whether a folder is a Zarr array or group."""
+    return any((path / name).is_file() for name in _METADATA_FILES)
+
+
+class ZarrBands:
+    """The rows of chunks of a Zarr array ``(lines, width)`` or ``(lines, width, channels)``.
+
+    Raises:
+        FileFormatError: a group, damaged metadata, or an array of other dimensions.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        try:
+            self._array = zarr.open_array(path, mode="r")
+        except Exception as error:  # damaged metadata surfaces as any of a dozen types
+            raise FileFormatError(path, f"not a readable Zarr array: {error}") from error
+        shape = self._array.shape
+        if len(shape) not in (2, 3):
+            raise FileFormatError(path, f"expected an array (lines, width, channels), got shape {shape}")
+        self.layout = (shape[0], shape[1], shape[2] if len(shape) == 3 else 1)
+        self.dtype = np.dtype(self._array.dtype).newbyteorder("=")
+        self.edges = even_edges(shape[0], self._array.chunks[0])
+
+    def __reduce__(self) -> tuple[type, tuple[Path]]:
+        return type(self), (self.path,)
+
+    def decode(self, band: int) -> NDArray:
+        """The lines of one row of chunks, (lines, width, channels)."""
+        pixels = np.asarray(self._array[int(self.edges[band]) : int(self.edges[band + 1])])
+        return pixels.astype(self.dtype, copy=False).reshape(-1, *self.layout[1:])

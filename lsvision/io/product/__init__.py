@@ -1,0 +1,1 @@
+"""Products on disk: layout, writing, reading, checking, export."""

@@ -1,0 +1,1 @@
+"""Scan -> corners: the board's corners in both images."""

@@ -1,0 +1,1 @@
+"""Scan, depth and motion -> product."""

@@ -1,0 +1,1 @@
+"""The Monte Carlo behind the studies: points, runs, tables, map."""

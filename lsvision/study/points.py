@@ -1,0 +1,159 @@
+"""The points of a study: what is simulated and estimated at each, and the corners that a board shows there exactly."""
+
+import itertools
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, fields, replace
+
+import dacite
+import torch
+from torch import Tensor
+
+from lsvision.errors import ConfigError
+from lsvision.simulation import BoardPose, MotionConfig, SceneConfig, SensorConfig, Simulation, simulate
+from lsvision.stages.calibration.config import CalibrationConfig
+from lsvision.stages.calibration.model import BoardProblem, join_state, motion_information, nominal_problem
+from lsvision.types import Board, CalibrationMethod, Rig
+
+# Of the simulated scan; corners are taken between its lines, so that it rounds nothing.
+_LINE_PITCH_MM = 0.07
+
+
+@dataclass(frozen=True)
+class Conditions:
+    """One point of a study: the boards' placing, the installation, what disturbs the corners, and how n is estimated.
+
+    ``corner_sigma_mm`` is the white noise of x and of the travel, ``depth_sigma_mm`` that of z; the calibration knows
+    both. It does not know of the vibration of x and z and of the encoder's error, sine waves with phases of their own
+    in every scan, given as rms values.
+    """
+
+    boards: str
+    angle_x_deg: float = 0.0
+    angle_z_deg: float = 0.0
+    stretch: float = 1.0
+    corner_sigma_mm: float = 0.02
+    depth_sigma_mm: float = 0.014
+    vibration_mm: float = 0.0
+    vibration_wavelength_mm: float = 100.0
+    encoder_mm: float = 0.0
+    encoder_wavelength_mm: float = 400.0
+    prior_sigma: float = 0.05
+    method: CalibrationMethod = "joint"
+    iterations: int = 20
+
+    def calibration(self, config: CalibrationConfig) -> CalibrationConfig:
+        """The calibration's options with those of this point."""
+        return replace(
+            config,
+            method=self.method,
+            prior_sigma=self.prior_sigma,
+            max_iterations=self.iterations,
+            two_step_max_iterations=self.iterations,
+        )
+
+
+@dataclass(frozen=True)
+class ExactCorners:
+    """The corners of a point's boards without noise, and the truth: ``points`` (x, travel, z) mm, poses and n."""
+
+    points: Tensor
+    board_points: Tensor
+    rotation: Tensor
+    translation: Tensor
+    n: Tensor
+
+    @property
+    def valid(self) -> Tensor:
+        """All corners are seen, ``(boards, corners)``."""
+        return torch.ones(self.points.shape[:-1], dtype=torch.bool)
+
+    @property
+    def depth_span_mm(self) -> float:
+        """Nearest to farthest corner of any board: what the cameras' range of depth has to hold."""
+        z = self.points[..., 2]
+        return float((z.amax(-1) - z.amin(-1)).max())
+
+    @property
+    def tilt_spread_deg(self) -> float:
+        """Largest angle between the normals of two boards; 0 where one tilt is repeated, or for one board."""
+        normals = self.rotation[..., 2]
+        return math.degrees(math.acos(min(1.0, float((normals @ normals.mT).min()))))
+
+
+def study_points(base: Conditions, axes: Mapping[str, Sequence[float | str] | None]) -> list[Conditions]:
+    """The grid of all axes, the last one fastest, over the base's conditions; an axis of None stays at its value.
+
+    Raises:
+        ConfigError: an axis that is no condition, is empty, or a value of the wrong type.
+    """
+    known = [item.name for item in fields(Conditions)]
+    varied = {name: values for name, values in axes.items() if values is not None}
+    for name, values in varied.items():
+        if name not in known:
+            raise ConfigError(f"axes.{name}: unknown; expected one of {', '.join(known)}")
+        if not values:
+            raise ConfigError(f"axes.{name}: the list is empty")
+    combinations = [dict(zip(varied, values, strict=True)) for values in itertools.product(*varied.values())]
+    try:
+        return [dacite.from_dict(Conditions, {**asdict(base), **values}) for values in combinations]
+    except dacite.WrongTypeError as error:
+        raise ConfigError(f"axes.{error.field_path}: {error.value!r} is not a value of it") from error
+
+
+def exact_corners(
+    rig: Rig, board: Board, placings: Mapping[str, Sequence[BoardPose]], conditions: Conditions
+) -> ExactCorners:
+    """The corners of a point's boards as the simulated cameras would see them without noise.
+
+    Raises:
+        ConfigError: the set of boards is not among the placings, or has none.
+    """
+    poses = placings.get(conditions.boards)
+    if not poses:
+        raise ConfigError(f"boards: expected one of {', '.join(placings)}, got {conditions.boards!r}")
+    simulations = [_simulation(rig, board, pose, conditions) for pose in poses]
+    body = board.corner_points()
+    points = []
+    for simulation in simulations:
+        pose = simulation.pose
+        x, line, z = simulation.trajectory.project(body @ pose.rotation.mT + pose.translation)
+        points.append(torch.stack([x, line * _LINE_PITCH_MM, z], dim=-1))
+    return ExactCorners(
+        points=torch.stack(points),
+        board_points=body.expand(len(poses), *body.shape),
+        rotation=torch.stack([simulation.pose.rotation for simulation in simulations]),
+        translation=torch.stack([simulation.pose.translation for simulation in simulations]),
+        n=simulations[0].trajectory.n,
+    )
+
+
+def noise_chol(conditions: Conditions) -> Tensor:
+    """Cholesky factor of the covariance that the calibration is told, ``(3, 3)`` mm."""
+    corner, depth = conditions.corner_sigma_mm, conditions.depth_sigma_mm
+    for name, value in (("corner_sigma_mm", corner), ("depth_sigma_mm", depth)):
+        if not value > 0:
+            raise ConfigError(f"{name}: expected a positive number, got {value}")
+    return torch.diag(torch.tensor([corner, corner, depth], dtype=torch.float64))
+
+
+def true_information(corners: ExactCorners, conditions: Conditions) -> Tensor:
+    """Fisher information of a point's corners on n at the truth, the poses unknown, without the prior; ``(3, 3)``."""
+    problem, state = true_problem(corners, noise_chol(conditions))
+    return motion_information(problem, state)
+
+
+def true_problem(corners: ExactCorners, chol: Tensor) -> tuple[BoardProblem, Tensor]:
+    """The calibration's problem with exact corners, written about the true poses, and the true state."""
+    problem, _ = nominal_problem(
+        corners.points, chol.expand(*corners.points.shape, 3), corners.board_points, corners.valid
+    )
+    problem = replace(problem, rotation=corners.rotation)
+    position = corners.translation + (corners.rotation @ problem.centroid[..., None])[..., 0]
+    return problem, join_state(torch.zeros_like(position), position, corners.n)
+
+
+def _simulation(rig: Rig, board: Board, pose: BoardPose, conditions: Conditions) -> Simulation:
+    scene = SceneConfig(kind="board", **asdict(pose))
+    motion = MotionConfig(conditions.angle_x_deg, conditions.angle_z_deg, conditions.stretch)
+    return simulate(rig, board, scene, motion, SensorConfig(), _LINE_PITCH_MM)

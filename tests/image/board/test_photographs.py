@@ -1,0 +1,43 @@
+"""Corners of real photographs: all boards found, and the stereo baseline that was published for them."""
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+
+from lsvision.image.board.detect import DetectedCorners, detect_board
+from lsvision.types import Board, TensorImage
+
+BOARD = Board(10, 7, 30.0)
+PRECISELY = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 200, 1e-9)
+
+
+def corners_of(folder: Path, name: str) -> DetectedCorners:
+    image = cv2.imread(str(folder / name), cv2.IMREAD_GRAYSCALE)
+    detected = detect_board(TensorImage(torch.from_numpy(image)[..., None]), BOARD)
+    assert detected is not None, name
+    assert detected.valid.all(), name
+    return detected
+
+
+def test_stereo_baseline_of_opencvs_photographs(shared_data: Path):
+    folder = shared_data / "checkerboard_opencv_stereo"
+    published = json.loads((folder / "bouguet_published_results.json").read_text())
+    left, right = (
+        [corners_of(folder, f"{side}{pair:02d}.jpg").position.numpy().astype(np.float32) for pair in published["pairs"]]
+        for side in ("left", "right")
+    )
+    points = [BOARD.corner_points().numpy().astype(np.float32)] * len(left)
+    size = tuple(published["image_size"])
+    cameras = []
+    for corners in (left, right):
+        rms, matrix, distortion, _, _ = cv2.calibrateCamera(points, corners, size, None, None, criteria=PRECISELY)
+        assert rms < 0.19  # OpenCV's own corners, refined by cornerSubPix, leave 0.195 and 0.207 px
+        cameras += [matrix, distortion]
+    result = cv2.stereoCalibrate(
+        points, left, right, *cameras, size, flags=cv2.CALIB_USE_INTRINSIC_GUESS, criteria=PRECISELY
+    )
+    baseline, after = result[6].ravel(), published["after_optimisation"]
+    assert (np.abs(baseline - after["T_mm"]) <= after["T_err_3sigma"]).all(), baseline

@@ -1,0 +1,123 @@
+"""Corners of scans: against the truth of two renderers, with their covariance."""
+
+import dataclasses
+from pathlib import Path
+
+import pytest
+import torch
+
+from lsvision.errors import BoardNotFoundError
+from lsvision.geometry import triangulate
+from lsvision.image.board.detect import DetectedCorners
+from lsvision.simulation import EncoderConfig
+from lsvision.stages.corners.config import CornersConfig
+from lsvision.stages.corners.find import _triangulated, find_corners
+from lsvision.types import Scan, TensorImage, Travel
+from tests.stages.other_renderer import tilt_corners, tilt_scans, true_points
+from tests.stages.rendered import BOARD, PITCH, SMALL_RIG, depth_scan, simulation, stereo_scan, true_measurement
+
+
+def rms(error: torch.Tensor) -> torch.Tensor:
+    return error.square().mean(0).sqrt()
+
+
+def test_corners_of_another_renderer(shared_data: Path):
+    errors, variances = [], []
+    for scan, corners in zip(tilt_scans(shared_data), tilt_corners(shared_data), strict=True):
+        assert corners.valid.all()
+        assert corners.scan == str(scan.path)
+        error = corners.points - true_points(scan)
+        assert (rms(error) <= 0.03).all()  # in depth a fortieth of a pixel: 1.26 mm each on this rig
+        errors.append(error)
+        variances.append(corners.covariance.diagonal(dim1=-2, dim2=-1))
+    ratio = rms(torch.cat(errors)) / torch.cat(variances).mean(0).sqrt()
+    assert (ratio < 2).all()
+    assert (ratio > 0.5).all()
+
+
+def test_one_corner_by_hand():
+    # On the axis of the left camera at zero disparity: x = 0, z = z0; line 100 at half weight each.
+    position = torch.tensor([[SMALL_RIG.principal_left_px, 100.0]], dtype=torch.float64)
+    covariance = 0.0004 * torch.eye(2).double()[None]
+    left = DetectedCorners(position, covariance, torch.ones(1, dtype=torch.bool))
+    right = dataclasses.replace(left, position=position + torch.tensor([[0.0, 0.5]]).double())
+    scan = Scan(Path("hand"), SMALL_RIG, Travel(PITCH), TensorImage(torch.zeros(2, 2, 1)), None, None)
+    points, covariance, valid = _triangulated(scan, left, right, CornersConfig())
+    z0 = SMALL_RIG.zero_disparity_mm
+    torch.testing.assert_close(
+        points[0], torch.tensor([0.0, 100.25 * PITCH, z0], dtype=torch.float64), rtol=0, atol=1e-9
+    )
+    by_disparity = z0**2 / (SMALL_RIG.focal_length_px * SMALL_RIG.baseline_mm)
+    expected = torch.tensor([0.02 * SMALL_RIG.object_pitch_mm, 0.02 / 2**0.5 * PITCH, 0.02 * 2**0.5 * by_disparity])
+    torch.testing.assert_close(covariance[0].diagonal().sqrt(), expected.double(), rtol=1e-6, atol=0)
+    apart = dataclasses.replace(left, position=position + torch.tensor([[0.0, 1.5]]).double())
+    assert valid.all()
+    assert not _triangulated(scan, left, apart, CornersConfig())[2].any()
+
+
+@pytest.mark.parametrize("transport", ["forward", "reverse"])
+def test_covariance_agrees_with_monte_carlo(transport):
+    draws = 20_000
+    factor_left = torch.tensor([[0.02, 0.0], [0.008, 0.015]]).double()
+    factor_right = torch.tensor([[0.03, 0.0], [-0.01, 0.02]]).double()
+
+    def detected(u: float, factor: torch.Tensor) -> DetectedCorners:
+        position = torch.tensor([u, 200.0]).double() + torch.randn(draws, 2).double() @ factor.mT
+        return DetectedCorners(position, (factor @ factor.mT).expand(draws, 2, 2), torch.ones(draws, dtype=torch.bool))
+
+    scan = Scan(Path("drawn"), SMALL_RIG, Travel(PITCH, None, transport), TensorImage(torch.zeros(2, 2, 1)), None, None)
+    points, covariance, valid = _triangulated(
+        scan, detected(300.0, factor_left), detected(293.0, factor_right), CornersConfig()
+    )
+    assert valid.all()
+    sampled, predicted = torch.cov(points.T), covariance.mean(0)
+    sigma = predicted.diagonal().sqrt()
+    torch.testing.assert_close(sampled / sigma / sigma[:, None], predicted / sigma / sigma[:, None], rtol=0, atol=0.05)
+
+
+@pytest.mark.parametrize("case", ["forward", "reverse", "encoder"])
+def test_rendered_boards_fit_their_truth(case):
+    encoder = EncoderConfig(enabled=True, wobble_mm=1.0) if case == "encoder" else None
+    source = simulation(transport="reverse" if case == "reverse" else "forward", encoder=encoder)
+    corners = find_corners(stereo_scan(source), BOARD)
+    assert corners.valid.all()
+    left, right = source.corners()
+    assert rms(corners.left_px - left).max() < 0.03
+    assert rms(corners.right_px - right).max() < 0.03
+    error = corners.points - true_measurement(source)
+    assert (rms(error) < torch.tensor([0.04, 0.04, 0.12])).all()  # 2.5 mm of depth per pixel
+
+
+def test_depth_maps_agree_with_two_images():
+    source = simulation()
+    stereo, mapped = find_corners(stereo_scan(source), BOARD), find_corners(depth_scan(source), BOARD)
+    assert mapped.right_px is None
+    assert mapped.valid.all()
+    error = mapped.points - true_measurement(source)
+    assert (rms(error) < torch.tensor([0.04, 0.04, 0.01])).all()
+    assert (rms(mapped.points - stereo.points) < torch.tensor([0.04, 0.04, 0.12])).all()
+    assert (torch.linalg.eigvalsh(mapped.covariance) > 0).all()
+
+
+def test_no_board_names_the_scan():
+    source = simulation()
+    scan = stereo_scan(source)
+    blank = TensorImage(torch.full_like(scan.left.tensor, 90))
+    with pytest.raises(BoardNotFoundError, match="rendered: no board of 12 x 9 squares in the left image"):
+        find_corners(dataclasses.replace(scan, left=blank), BOARD)
+    with pytest.raises(BoardNotFoundError, match="in the right image"):
+        find_corners(dataclasses.replace(scan, right=blank), BOARD)
+    with pytest.raises(BoardNotFoundError, match=r"88 of 88 corners .* 89 are needed"):
+        find_corners(scan, BOARD, CornersConfig(min_corners=89))
+
+
+def test_corners_without_depth_are_not_valid():
+    scan = depth_scan(simulation())
+    depth = scan.depth.tensor.clone()
+    depth[: len(depth) // 2] = torch.nan
+    corners = find_corners(dataclasses.replace(scan, depth=TensorImage(depth)), BOARD)
+    assert 20 <= int(corners.valid.sum()) < 88
+    assert corners.points[~corners.valid].isnan().all()
+    assert corners.covariance[~corners.valid].isnan().all()
+    _, z = triangulate(SMALL_RIG, torch.zeros(1).double(), torch.zeros(1).double())
+    assert (corners.points[corners.valid, 2] - z).abs().max() < 40

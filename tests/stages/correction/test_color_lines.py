@@ -1,0 +1,71 @@
+"""Trilinear sensors: in the product, every colour lies where a sensor that sees all colours at once would show it."""
+
+import dataclasses
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from lsvision.simulation import EncoderConfig, MotionConfig, SceneConfig, SensorConfig, simulate
+from lsvision.stages.correction.config import CorrectionConfig
+from lsvision.stages.correction.correct import correct_scan
+from lsvision.types import Motion
+from tests.stages.rendered import BOARD, PITCH, SMALL_RIG, depth_scan
+
+MOTION = MotionConfig(angle_x_deg=-2.0, angle_z_deg=2.0, stretch=1.07)
+CONFIG = CorrectionConfig(height_range_mm=(-30.0, 30.0), strip_rows=1000)
+WOBBLE = EncoderConfig(enabled=True, wobble_mm=3.0, noise_mm=0.0)
+PATCH = (slice(90, 250), slice(170, 300))
+APART = 1.5
+
+
+def product(spacing: float, *, registered: bool, transport: str, encoder: EncoderConfig | None, corrected: bool = True):
+    """Colours of a sheet seen by a sensor whose red and blue lines look ``spacing`` lines before and after green."""
+    rig = dataclasses.replace(SMALL_RIG, color_spacing_lines=(-spacing, 0.0, spacing))
+    sensor = SensorConfig(supersampling=2, noise=0.0, color_registered=registered)
+    sheet = SceneConfig(kind="sheet", yaw_deg=3.0)
+    source = simulate(rig, BOARD, sheet, MOTION, sensor, PITCH, transport=transport, encoder=encoder)
+    scan = dataclasses.replace(depth_scan(source), color_registered=registered)
+    if not corrected:
+        scan = dataclasses.replace(scan, rig=SMALL_RIG)
+    motion = Motion(source.trajectory.n, torch.zeros(3, 3).double())
+    (strip,) = correct_scan(scan, scan.depth, motion, CONFIG)
+    assert bool(strip.valid[PATCH].all())
+    return strip.color[PATCH].to(torch.float32)
+
+
+def shift_along(image: Tensor, truth: Tensor) -> float:
+    """Rows by which an image lies further than another of the same: least squares on the gradient."""
+    smooth = cv2.GaussianBlur(truth.numpy(), (0, 0), 1.5)
+    other = cv2.GaussianBlur(image.numpy(), (0, 0), 1.5)
+    moved, total = other, 0.0
+    for _ in range(8):
+        slope = np.gradient(moved, axis=0)[8:-8, 8:-8]
+        step = float(((smooth - moved)[8:-8, 8:-8] * slope).sum() / (slope * slope).sum())
+        total += step
+        transform = np.array([[1, 0, 0], [0, 1, total]], np.float32)
+        moved = cv2.warpAffine(other, transform, other.shape[::-1], flags=cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP)
+    return -total
+
+
+@pytest.mark.parametrize("encoder", [None, WOBBLE], ids=["constant", "encoder"])
+@pytest.mark.parametrize("transport", ["forward", "reverse"])
+@pytest.mark.parametrize("registered", [False, True], ids=["raw", "registered"])
+def test_red_and_blue_meet(registered: bool, transport: str, encoder: EncoderConfig | None) -> None:
+    options = {"registered": registered, "transport": transport, "encoder": encoder}
+    truth = product(0.0, **options)
+    trilinear = product(APART / 2, **options)
+    red, green, blue = (shift_along(trilinear[..., c], truth[..., c]) for c in range(3))
+    assert abs(red - blue) <= 0.05
+    assert max(abs(red), abs(green), abs(blue)) <= 0.05
+
+
+def test_uncorrected_they_lie_as_far_apart_as_the_sensor_lines() -> None:
+    options = {"registered": False, "transport": "forward", "encoder": None}
+    truth = product(0.0, **options)
+    fringed = product(APART / 2, **options, corrected=False)
+    assert abs(shift_along(fringed[..., 0], truth[..., 0]) - shift_along(fringed[..., 2], truth[..., 2])) == (
+        pytest.approx(APART, abs=0.1)
+    )

@@ -1,0 +1,172 @@
+"""Disparity and depth of strips: the search range, reads of any range, and the height of a rendered plane."""
+
+import dataclasses
+import math
+from pathlib import Path
+
+import pytest
+import torch
+
+from lsvision.geometry import depth_at, triangulate, triangulation_jacobian
+from lsvision.image.brightness import gray
+from lsvision.image.stereo.sgbm import match_sgbm
+from lsvision.simulation import SceneConfig
+from lsvision.stages.disparity.config import DisparityConfig
+from lsvision.stages.disparity.depth import MatchedDepth, depth_of, depth_sigma
+from lsvision.stages.disparity.match import StripMatch, disparity_range, measure_strip
+from lsvision.types import Scan, TensorImage, Travel
+from tests.stages.rendered import FULL_RIG, PITCH, SMALL_RIG, simulation, stereo_scan
+
+CONFIG = DisparityConfig(block_lines=64, halo_lines=16)
+FINE = DisparityConfig(
+    matcher="coarse_to_fine", refine_iterations=1, largest_sigma_px=0.2, block_lines=64, halo_lines=32
+)
+
+
+@pytest.fixture(scope="module")
+def sheet():
+    source = simulation(SceneConfig("sheet", pitch_deg=2.0, roll_deg=1.5, texture_mm=1.5, margin_mm=0.0))
+    return source, stereo_scan(source)
+
+
+def test_default_range_is_that_of_the_camera():
+    low, high = disparity_range(FULL_RIG, DisparityConfig())
+    assert abs(low + 165) <= 1
+    assert abs(high - 165) <= 1
+    small = disparity_range(SMALL_RIG, DisparityConfig())
+    assert small == (math.floor(low / 16), math.ceil(high / 16))
+
+
+def test_depth_equals_triangulation_pixel_by_pixel():
+    disparity = torch.tensor([[0.0, 3.5, torch.nan, -7.25]])
+    depth = depth_at(SMALL_RIG, disparity)
+    assert depth.dtype == torch.float32
+    assert depth[0, 0] == pytest.approx(SMALL_RIG.zero_disparity_mm)
+    for column, value in enumerate(disparity[0].double()):
+        expected = triangulate(SMALL_RIG, torch.tensor(float(column)).double(), value)[1]
+        torch.testing.assert_close(depth[0, column].double(), expected, rtol=1e-6, atol=0, equal_nan=True)
+
+
+@pytest.mark.parametrize("config", [CONFIG, FINE])
+@pytest.mark.parametrize("strip_lines", [64, 100, 257, 10_000])
+def test_strips_of_any_height_and_the_whole_are_equal(sheet, config, strip_lines):
+    left, right = sheet[1].left.read(0, sheet[1].lines), sheet[1].right.read(0, sheet[1].lines)
+    untiled = depth_at(SMALL_RIG, measure_strip(left, right, SMALL_RIG, config).disparity)
+    tiled = MatchedDepth(sheet[1], dataclasses.replace(config, strip_lines=strip_lines))
+    parts = [tiled.read(start, min(start + strip_lines, len(left))) for start in range(0, len(left), strip_lines)]
+    assert torch.cat(parts)[..., 0].numpy().tobytes() == untiled.numpy().tobytes()
+
+
+@pytest.mark.parametrize("config", [CONFIG, FINE])
+def test_values_do_not_depend_on_the_range_read(sheet, config):
+    scan = sheet[1]
+    whole = MatchedDepth(scan, config).read(0, scan.lines)
+    assert whole.shape == (scan.lines, SMALL_RIG.width_px, 1)
+    lazy = MatchedDepth(scan, config, kept_blocks=2)
+    for start, stop in ((0, 5), (60, 70), (100, 200), (63, 64), (scan.lines - 3, scan.lines), (10, 12)):
+        torch.testing.assert_close(lazy.read(start, stop), whole[start:stop], rtol=0, atol=0, equal_nan=True)
+        assert len(lazy._blocks) <= 2
+
+
+@pytest.mark.parametrize("config", [CONFIG, dataclasses.replace(FINE, refine_iterations=2)])
+def test_height_of_a_rendered_plane(sheet, config):
+    source, scan = sheet
+    depth = MatchedDepth(scan, config).read(0, scan.lines)[..., 0]
+    truth = torch.cat(list(source.depth_strips()))
+    inside = (slice(40, -40), slice(80, -80))
+    error_px = to_disparity(depth, truth)[inside]
+    assert torch.isfinite(error_px).float().mean() > 0.95
+    error_px = error_px[torch.isfinite(error_px)]
+    assert error_px.square().mean().sqrt() < 0.05
+    assert abs(error_px.mean()) < 0.01
+
+
+def test_deviation_is_that_of_the_errors(sheet):
+    source, scan = sheet
+    matched = MatchedDepth(scan, CONFIG)
+    depth, sigma = (read(0, scan.lines)[..., 0] for read in (matched.read, matched.read_sigma))
+    assert torch.equal(depth.isnan(), sigma.isnan())
+    inside = (slice(40, -40), slice(80, -80))
+    truth = torch.cat(list(source.depth_strips()))
+    normalised = ((depth - truth) / sigma)[inside]
+    # The median of |error| / sigma is 0.6745 of a normal distribution.
+    assert abs(normalised.abs().nanmedian() / 0.6745 - 1) < 0.3
+
+
+def test_deviation_of_depth_follows_the_triangulation():
+    disparity, column = torch.tensor([-30.0, 0.0, 12.5]).double(), torch.tensor([10.0, 200.0, 400.0]).double()
+    depth = triangulate(SMALL_RIG, column, disparity)[1]
+    sigma = torch.tensor([0.02, 0.05, 0.3]).double()
+    expected = triangulation_jacobian(SMALL_RIG, column, disparity)[:, 1, 1].abs() * sigma
+    torch.testing.assert_close(depth_sigma(depth, sigma, SMALL_RIG), expected)
+
+
+@pytest.mark.parametrize("config", [CONFIG, FINE])
+def test_images_that_match_nothing(sheet, config):
+    scan = sheet[1]
+    left, right = scan.left.read(64, 192), scan.right.read(64, 192)
+    black, white = torch.zeros_like(left), torch.full_like(left, 255)
+    for pair in ((left, black), (black, right), (left, white)):
+        match = measure_strip(*pair, SMALL_RIG, config)
+        assert torch.isfinite(match.disparity).float().mean() < 0.1
+    flat = measure_strip(black, black, SMALL_RIG, config)
+    # Without any texture a match says nothing, and its deviation says so.
+    assert not (flat.sigma < 0.1).any()
+
+
+@pytest.mark.parametrize("config", [CONFIG, FINE])
+def test_mono_and_sixteen_bit_scans_match_alike(sheet, config):
+    scan = sheet[1]
+    left, right = scan.left.read(64, 192), scan.right.read(64, 192)
+    colour = measure_strip(left, right, SMALL_RIG, config).disparity
+    mono = (gray(image).round().to(torch.uint8)[..., None] for image in (left, right))
+    deep = (image.to(torch.int32).mul(257).to(torch.uint16) for image in (left, right))
+    for pair in (mono, deep):
+        other = measure_strip(*pair, SMALL_RIG, config).disparity
+        both = torch.isfinite(colour) & torch.isfinite(other)
+        assert both.float().mean() > 0.9 * torch.isfinite(colour).float().mean()
+        assert (colour - other)[both].abs().median() < 0.01
+
+
+def test_hidden_pixels_are_told_from_failed_ones():
+    disparity = torch.zeros(2, 40)
+    disparity[:, 20:] = 6.0
+    disparity[:, 14:20] = torch.nan
+    disparity[:, 4:7] = torch.nan
+    match = StripMatch(disparity, torch.full_like(disparity, 0.1))
+    assert match.occluded()[0].nonzero()[:, 0].tolist() == list(range(14, 20))
+
+
+def to_disparity(depth, truth):
+    """Error of depths in pixels of disparity."""
+    scale = SMALL_RIG.focal_length_px * SMALL_RIG.baseline_mm
+    return scale / depth.double() - scale / truth.double()
+
+
+def test_no_refinement_is_the_matcher_alone(sheet):
+    scan = sheet[1]
+    left, right = scan.left.read(0, 64), scan.right.read(0, 64)
+    config = dataclasses.replace(CONFIG, refine_iterations=0, block_lines=64, halo_lines=0)
+    low, high = disparity_range(SMALL_RIG, config)
+    expected = match_sgbm(
+        left,
+        right,
+        minimum_px=low,
+        maximum_px=high,
+        block_size=5,
+        lambda1=8.0,
+        lambda2=32.0,
+        left_right_check_px=10,
+        uniqueness_percent=5,
+        speckle_px=100,
+    )
+    depth = MatchedDepth(scan, config).read(0, 64)[..., 0]
+    torch.testing.assert_close(depth, depth_at(SMALL_RIG, expected), equal_nan=True)
+
+
+def test_own_depth_comes_first():
+    image = TensorImage(torch.zeros(4, SMALL_RIG.width_px, 1, dtype=torch.uint8))
+    depth = TensorImage(torch.full((4, SMALL_RIG.width_px, 1), 800.0))
+    scan = Scan(Path("both"), SMALL_RIG, Travel(PITCH), image, image, depth)
+    assert depth_of(scan, CONFIG) is depth
+    assert isinstance(depth_of(dataclasses.replace(scan, depth=None), CONFIG), MatchedDepth)

@@ -1,0 +1,228 @@
+"""Studies: the same table whatever the batch, figures that agree with theory, the paper's degeneracy."""
+
+import dataclasses
+import itertools
+import json
+import math
+
+import polars
+import pytest
+import torch
+from hydra import compose, initialize_config_dir
+
+from lsvision.errors import ConfigError
+from lsvision.estimation import fisher_information, marginal_information
+from lsvision.geometry import displace, transform
+from lsvision.run import config_folder
+from lsvision.simulation import BoardPose
+from lsvision.stages.calibration.calibrate import calibrate_batch
+from lsvision.stages.calibration.config import CalibrationConfig
+from lsvision.stages.calibration.model import squared_residuals, whitened_residuals
+from lsvision.study.map import tilt_map
+from lsvision.study.points import (
+    Conditions,
+    exact_corners,
+    noise_chol,
+    study_points,
+    true_information,
+    true_problem,
+)
+from lsvision.study.runs import noisy_points, run_points
+from lsvision.study.tables import iterations_table, points_table, runs_table
+from lsvision.types import Board
+
+BOARD = Board(5, 4, 60.0)
+PLACINGS = {
+    "one": [BoardPose(2.0, 1.5, 0.0)],
+    "flat": [BoardPose(0.0, 0.0, 0.0)],
+    "two": [BoardPose(2.0, 1.5, 0.0), BoardPose(-5.0, 1.0, 6.0)],
+}
+POINT = Conditions("two", angle_x_deg=2.0, angle_z_deg=1.5, stretch=1.0246)
+
+
+def runs_of(rig, points, *, runs, batch=32, threads=1, seed=0):
+    corners = [exact_corners(rig, BOARD, PLACINGS, point) for point in points]
+    found = run_points(points, corners, CalibrationConfig(), runs=runs, batch=batch, seed=seed, threads=threads)
+    return corners, found
+
+
+def table_of(rig, points, **options):
+    corners, found = runs_of(rig, points, **options)
+    runs = runs_table(points, corners, found)
+    return runs, points_table(points, corners, runs), iterations_table(found)
+
+
+def test_the_same_seed_gives_the_same_tables_for_any_batch_and_threads(rig):
+    points = [POINT, dataclasses.replace(POINT, boards="one"), dataclasses.replace(POINT, vibration_mm=0.5)]
+    reference = table_of(rig, points, runs=70)
+    for batch, threads in ((1, 2), (7, 1), (64, 2), (100, 1)):
+        for table, other in zip(reference, table_of(rig, points, runs=70, batch=batch, threads=threads), strict=True):
+            assert table.equals(other)
+    assert not reference[0].equals(table_of(rig, points, runs=70, seed=1)[0])
+
+
+def test_a_run_is_a_calibration_of_its_own_corners(rig):
+    (corners,), (found,) = runs_of(rig, [POINT], runs=70)
+    measured = noisy_points(corners, POINT, seed=0, first=66, last=67)
+    chol = noise_chol(POINT)
+    covariance = (chol @ chol.mT).expand(*corners.points.shape, 3)
+    alone = calibrate_batch(measured[0], covariance, corners.board_points, corners.valid, CalibrationConfig())
+    torch.testing.assert_close(found.n[66], alone.n, rtol=0, atol=0)
+    torch.testing.assert_close(found.covariance[66], alone.covariance, rtol=0, atol=0)
+
+
+def test_noise_is_as_large_as_asked_for(rig):
+    noisy = dataclasses.replace(POINT, corner_sigma_mm=0.1, depth_sigma_mm=0.02)
+    corners = exact_corners(rig, BOARD, PLACINGS, noisy)
+    error = noisy_points(corners, noisy, 0, 0, 500) - corners.points
+    torch.testing.assert_close(error.std((0, 1, 2)), error.new_tensor([0.1, 0.1, 0.02]), rtol=0.03, atol=0)
+    swinging = dataclasses.replace(POINT, corner_sigma_mm=1e-9, depth_sigma_mm=1e-9, vibration_mm=0.3, encoder_mm=0.2)
+    error = noisy_points(corners, swinging, 0, 0, 500) - corners.points
+    rms = error.square().mean((0, 1, 2)).sqrt()
+    torch.testing.assert_close(rms, error.new_tensor([0.3, 0.2, 0.3]), rtol=0.05, atol=0)
+    # Every scan has a phase of its own, all corners of one travel move together.
+    assert (error[:, 0, 0, 0] - error[:, 1, 0, 0]).abs().max() > 0.1
+
+
+def test_exact_corners_fit_the_truth(rig):
+    corners = exact_corners(rig, BOARD, PLACINGS, POINT)
+    moved = displace(corners.points, corners.n)
+    expected = transform(corners.rotation, corners.translation, corners.board_points)
+    torch.testing.assert_close(moved, expected, rtol=0, atol=1e-9)
+    assert float(corners.n.norm()) == pytest.approx(1.0246)
+    assert math.degrees(math.atan2(corners.n[2], corners.n[1])) == pytest.approx(1.5)
+    # From normals tilted by (2°, 1.5°) and (-5°, 1°).
+    assert corners.tilt_spread_deg == pytest.approx(7.0, abs=0.3)
+    problem, state = true_problem(corners, noise_chol(POINT))
+    assert squared_residuals(problem, state).max() < 1e-16
+
+
+def test_information_is_that_of_the_exact_likelihood(rig):
+    corners = exact_corners(rig, BOARD, PLACINGS, POINT)
+    problem, state = true_problem(corners, noise_chol(POINT))
+    whole = fisher_information(lambda x: whitened_residuals(problem, x), state)
+    torch.testing.assert_close(true_information(corners, POINT), marginal_information(whole, 3), rtol=1e-5, atol=1.0)
+
+
+def test_an_efficient_method_reaches_the_bound_and_says_so(rig):
+    _, points, _ = table_of(rig, [POINT], runs=1000, batch=100)
+    row = points.row(0, named=True)
+    assert row["error_over_bound"] == pytest.approx(1.0, abs=0.06)
+    for k in (1, 2, 3):
+        assert row[f"rms_n{k}"] / row[f"bound_n{k}"] == pytest.approx(1.0, abs=0.06)
+        assert row[f"sigma_n{k}"] / row[f"bound_n{k}"] == pytest.approx(1.0, abs=0.02)
+        assert abs(row[f"bias_n{k}"]) < 4 * row[f"std_n{k}"] / math.sqrt(1000)
+    assert 2.85 < row["nees"] < 3.15  # the 95 % band of the mean of 1000 is 2.849..3.153
+    assert row["converged"] == 1.0
+    assert row["prior_dominated"] == row["failed"] == 0.0
+
+
+def test_one_board_gives_back_the_prior_and_says_so(rig):
+    points = [dataclasses.replace(POINT, boards="flat", angle_z_deg=angle) for angle in (-3.0, 3.0)]
+    runs, table, _ = table_of(rig, points, runs=20)
+    assert table["prior_dominated"].to_list() == [1.0, 1.0]
+    assert runs["n3"].abs().max() < 0.01 < 0.05 < points_truth(runs).abs().min()
+    assert runs["sigma_n3"].min() > 0.045
+
+
+def points_truth(runs):
+    return runs["n3"] - runs["error_n3"]
+
+
+def test_two_steps_contract_slowly_and_the_joint_update_at_once(rig):
+    points = [dataclasses.replace(POINT, method=method, iterations=8) for method in ("joint", "two_step")]
+    _, table, iterations = table_of(rig, points, runs=4)
+    joint, two_step = (iterations.filter(polars.col("point") == i)["median"].to_list() for i in (0, 1))
+    assert joint[2] < 0.05
+    ratios = [after / before for before, after in itertools.pairwise(two_step)]
+    assert all(0.8 < ratio < 1.0 for ratio in ratios)
+    assert table["converged"].to_list() == [1.0, 0.0]
+
+
+def test_iterations_allowed_and_used_are_told_apart(rig):
+    points = [dataclasses.replace(POINT, iterations=most) for most in (2, 20)]
+    _, table, _ = table_of(rig, points, runs=4)
+    assert table["iterations"].to_list() == [2, 20]
+    assert table["iterations_used"][0] == 2.0
+    assert 2.0 < table["iterations_used"][1] < 6.0
+
+
+def test_unknown_vibration_shows_in_error_and_noise_scale(rig):
+    points = [POINT, dataclasses.replace(POINT, vibration_mm=0.3)]
+    _, table, _ = table_of(rig, points, runs=40)
+    quiet, shaken = table.iter_rows(named=True)
+    assert shaken["error_over_bound"] > 3 * quiet["error_over_bound"]
+    assert shaken["noise_scale"] > 10
+    assert quiet["noise_scale"] < 1.1
+
+
+def test_map_is_blind_at_its_centre_and_sharpens_outwards(rig):
+    tilts = tilt_map(rig, BOARD, POINT, 10.0, 5)
+    assert tilts.tilts_deg.tolist() == [-10.0, -5.0, 0.0, 5.0, 10.0]
+    share = tilts.sigma / tilts.prior_sigma
+    assert share[2, 2] == pytest.approx(1.0, abs=1e-3)
+    assert (share[2, 2] > share[2, 3] > share[2, 4]).item()
+    assert share[0, 0] < 0.05
+
+
+def test_points_are_the_grid_of_the_axes():
+    points = study_points(POINT, {"boards": ["one", "two"], "corner_sigma_mm": [0.01, 0.02, 1]})
+    assert [(point.boards, point.corner_sigma_mm) for point in points] == [
+        (boards, sigma) for boards in ("one", "two") for sigma in (0.01, 0.02, 1)
+    ]
+    assert study_points(POINT, {"stretch": None}) == [POINT]
+
+
+@pytest.mark.parametrize(
+    ("axes", "told"),
+    [
+        ({"spam": [1]}, r"axes\.spam: unknown; expected one of boards, "),
+        ({"stretch": []}, r"axes\.stretch: the list is empty"),
+        ({"stretch": ["wide"]}, r"axes\.stretch: 'wide'"),
+        ({"method": ["guess"]}, r"axes\.method: 'guess'"),
+    ],
+)
+def test_a_wrong_axis_is_named(axes, told):
+    with pytest.raises(ConfigError, match=told):
+        study_points(POINT, axes)
+
+
+def test_wrong_conditions_are_named(rig):
+    with pytest.raises(ConfigError, match="boards: expected one of one, flat, two, got 'three'"):
+        exact_corners(rig, BOARD, PLACINGS, dataclasses.replace(POINT, boards="three"))
+    with pytest.raises(ConfigError, match="depth_sigma_mm"):
+        noise_chol(dataclasses.replace(POINT, depth_sigma_mm=0.0))
+
+
+def test_command_writes_tables_and_report(command, tmp_path):
+    axes = ("axes.boards=[one_tilted,two_tilted]", "axes.method=[joint,two_step]", "axes.angle_z_deg=[-1.0,1.0]")
+    assert command("+experiment=study", *axes, "runs=4", "conditions.iterations=3", "map_steps=5") == 0
+    folder = tmp_path / "run"
+    assert len(polars.read_parquet(folder / "runs.parquet")) == 32
+    points = polars.read_parquet(folder / "points.parquet")
+    assert points.select("boards", "method", "angle_z_deg").row(1) == ("one_tilted", "joint", 1.0)
+    assert polars.read_parquet(folder / "iterations.parquet")["iteration"].max() == 3
+    summary = json.loads((folder / "summary.json").read_text())
+    assert (summary["points"], summary["calibrations"], len(summary["results"])) == (8, 32, 8)
+    names = {path.stem for path in (folder / "figures").glob("*.svg")}
+    assert names >= {"placings", "truth_and_estimate", "convergence", "tilt_map", "consistency", "accuracy_board_count"}
+    assert (folder / "report.html").is_file()
+
+
+@pytest.mark.parametrize("override", ["runs=0", "batch=0", "axes.stretch=[wide]"])
+def test_a_wrong_option_is_one_line(override, command, capsys):
+    assert command("+experiment=study", override) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("error: " + override.split("=")[0])
+
+
+@pytest.mark.parametrize("name", ["study_paper", "study_tilts", "study_noise", "study_vibration", "study_convergence"])
+def test_shipped_studies_have_points(name):
+    with initialize_config_dir(str(config_folder()), version_base="1.3"):
+        config = compose("config", [f"+experiment={name}"])
+    points = study_points(Conditions(**config.conditions), config.axes)
+    assert len(points) >= 10
+    assert {point.boards for point in points} <= set(config.placings)
+    if name == "study_tilts":
+        assert len(points) * config.runs == 10_000
+        assert all(len(config.placings[point.boards]) == 3 for point in points)
