@@ -2,7 +2,7 @@
 
 Units are millimetres, pixels and lines; angles are radians unless a name ends in ``_deg``. Pixel centres are integers.
 Leading batch dimensions are written ``*batch``. Frames are those of the README's convention table: scan frame S, board
-frame C, product frame M.
+frame C, product frame M. One file, long as it is: it is the vocabulary that all packages share.
 """
 
 from collections.abc import Mapping
@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Literal, Protocol, runtime_checkable
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Shaped
 from torch import Tensor
 
 Transport = Literal["forward", "reverse"]
@@ -127,17 +127,36 @@ class TensorImage:
 
 
 @dataclass(frozen=True)
+class StereoPair:
+    """The images of a scan that two cameras took, line by line at the same moments."""
+
+    left: LineImage
+    right: LineImage
+
+
+@dataclass(frozen=True)
+class DepthView:
+    """The image of a scan whose camera matched itself, and its depth map: float32 z, mm, NaN where not measured."""
+
+    left: LineImage
+    depth: LineImage
+
+
+@dataclass(frozen=True)
 class Scan:
-    """One pass of an object under the rig: two images, or one image and the depth map a camera computed."""
+    """One pass of an object under the rig."""
 
     path: Path
     rig: Rig
     travel: Travel
-    left: LineImage
-    right: LineImage | None
-    depth: LineImage | None
+    images: StereoPair | DepthView
     color_registered: bool = True
     attributes: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def left(self) -> LineImage:
+        """The image that colours come from and positions refer to."""
+        return self.images.left
 
     @property
     def lines(self) -> int:
@@ -146,11 +165,55 @@ class Scan:
 
 
 @dataclass(frozen=True)
-class Pose:
-    """Frame of a target in the object's own coordinates: ``p = rotation p_frame + translation``, float64, mm."""
+class Depth:
+    """Depth of some scan lines.
 
-    rotation: Tensor
-    translation: Tensor
+    Attributes:
+        z: mm in the scan frame, float32, NaN where not measured.
+        sigma: its standard deviation, mm, or None where it is not known.
+    """
+
+    z: Float[Tensor, "lines width"]
+    sigma: Float[Tensor, "lines width"] | None = None
+
+
+class DepthSource(Protocol):
+    """The depth of a scan's left image, read by line ranges."""
+
+    @property
+    def lines(self) -> int:
+        """Number of lines of the scan."""
+        ...
+
+    def read(self, start: int, stop: int) -> Depth:
+        """Depth of lines ``start..stop-1``."""
+        ...
+
+
+@dataclass(frozen=True)
+class StoredDepth:
+    """A depth map in a file, and its standard deviation where that was stored too."""
+
+    z: LineImage
+    sigma: LineImage | None = None
+
+    @property
+    def lines(self) -> int:
+        """Number of lines of the scan."""
+        return self.z.shape[0]
+
+    def read(self, start: int, stop: int) -> Depth:
+        """Depth of lines ``start..stop-1``."""
+        sigma = None if self.sigma is None else self.sigma.read(start, stop)[..., 0]
+        return Depth(self.z.read(start, stop)[..., 0], sigma)
+
+
+@dataclass(frozen=True)
+class Pose:
+    """Where the frame of a target stands: ``p = rotation p_frame + translation``, mm."""
+
+    rotation: Float[Tensor, "*batch 3 3"]
+    translation: Float[Tensor, "*batch 3"]
 
 
 @dataclass(frozen=True)
@@ -273,20 +336,40 @@ class ProductGrid:
     origin_y_mm: float
     origin_x_mm: float
 
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(rows, columns)."""
+        return self.rows, self.columns
+
+    @property
+    def origin_mm(self) -> tuple[float, float]:
+        """(q_y, q_x) of the centre of cell (0, 0)."""
+        return self.origin_y_mm, self.origin_x_mm
+
+    def q_x(self, columns: slice) -> Float[Tensor, " columns"]:
+        """Places of a range of columns across the motion, mm, float64."""
+        return self.origin_x_mm + self.pitch_mm * torch.arange(columns.start, columns.stop).double()
+
+    def q_y(self, row: int) -> float:
+        """Place of a row along the motion, mm."""
+        return self.origin_y_mm + self.pitch_mm * row
+
 
 @dataclass(frozen=True)
 class ProductStrip:
-    """Consecutive rows of a product.
+    """Consecutive rows of a product, the first of which is ``row``.
 
-    ``color (rows, columns, channels)`` in the scan's dtype, ``height (rows, columns)`` float32 mm over the plane of
-    zero disparity, NaN where not measured, ``valid`` where it is, ``source (rows, columns, 2)`` float32 (line, column)
-    that the colour came from, NaN where nothing was seen, ``sigma (rows, columns, 3)`` float32 mm the standard
-    deviations of q_x, q_y and q_z, where they were asked for.
+    Attributes:
+        color: in the scan's dtype.
+        height: float32, mm towards the cameras from the middle of the plane of zero disparity, NaN where not measured.
+        valid: where the height was measured.
+        source: float32 (line, column) of the scan that the colour came from, NaN where no line saw the cell.
+        sigma: float32, mm, standard deviations of (q_x, q_y, q_z), where they were asked for.
     """
 
     row: int
-    color: Tensor
-    height: Tensor
-    valid: Tensor
-    source: Tensor
-    sigma: Tensor | None = None
+    color: Shaped[Tensor, "rows columns channels"]
+    height: Float[Tensor, "rows columns"]
+    valid: Bool[Tensor, "rows columns"]
+    source: Float[Tensor, "rows columns 2"]
+    sigma: Float[Tensor, "rows columns 3"] | None = None

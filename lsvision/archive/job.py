@@ -23,6 +23,7 @@ from lsvision.archive.tasks import (
     is_finished,
     remove_partial_chunks,
 )
+from lsvision.geometry import ProductFrame
 from lsvision.io import ProductLayout, create_product, read_scan
 from lsvision.types import Scan
 
@@ -142,7 +143,7 @@ def _layout(planned: PlannedScan, place: Place, scan: Scan, key: str) -> Product
             "scan": str(planned.path),
             "version": __version__,
             "n": motion.n.tolist(),
-            "zero_disparity_mm": scan.rig.zero_disparity_mm,
+            "height_datum_mm": ProductFrame(scan.rig, scan.travel, motion.n).height_datum_mm,
             "attributes": dict(scan.attributes),
             "calibration": str(planned.calibration.path),
             "disparity": asdict(place.processing.disparity),

@@ -16,7 +16,7 @@ from lsvision.stages.correction.config import CorrectionConfig
 from lsvision.stages.correction.grid import plan_product
 from lsvision.stages.disparity.config import DisparityConfig
 from lsvision.stages.disparity.match import disparity_range
-from lsvision.types import ProductGrid, Scan
+from lsvision.types import ProductGrid, Scan, StereoPair
 
 # Peak of a worker over an idle one, as measured; an idle one holds torch, OpenCV and the decoded ends of its files.
 IDLE_BYTES = 500 * 2**20
@@ -149,7 +149,7 @@ def _planned(item: Found, calibrations: Sequence[DatedCalibration], processing: 
         stamp=stamp,
         lines=scan.lines,
         width=scan.rig.width_px,
-        matched=scan.depth is None,
+        matched=isinstance(scan.images, StereoPair),
         cell_bytes=scan.left.shape[2] * scan.left.dtype.itemsize + 13,  # height 4, valid 1, source 8
         calibration=calibration,
         grid=grid,
@@ -161,7 +161,7 @@ def _planned(item: Found, calibrations: Sequence[DatedCalibration], processing: 
 
 def _strip_rows(scan: Scan, grid: ProductGrid, processing: Processing, path: Path) -> int:
     memory_bytes = processing.worker_memory_mb * 2**20
-    if scan.depth is None:
+    if isinstance(scan.images, StereoPair):
         low, high = disparity_range(scan.rig, processing.disparity)
         lines = processing.disparity.block_lines + 2 * processing.disparity.halo_lines
         # Besides images and their gradients the matcher keeps costs of a few lines over the whole range.

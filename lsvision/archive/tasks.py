@@ -32,11 +32,11 @@ from lsvision.io import (
     scan_sha256,
 )
 from lsvision.stages.correction.config import CorrectionConfig
-from lsvision.stages.correction.correct import correct_rows
+from lsvision.stages.correction.correct import Correction
 from lsvision.stages.correction.grid import plan_product
 from lsvision.stages.disparity.config import DisparityConfig
-from lsvision.stages.disparity.depth import MatchedDepth
-from lsvision.types import LineImage, Motion, Scan
+from lsvision.stages.disparity.depth import depth_of
+from lsvision.types import Motion, Scan, StoredDepth
 
 # The arrays of the working store.
 DEPTH, SIGMA = "depth.zarr", "sigma.zarr"
@@ -90,13 +90,11 @@ class MatchStrip:
         scan = _open_scan(self.scan)
         start = self.number * self.config.work_lines
         stop = min(start + self.config.work_lines, scan.lines)
-        matched = MatchedDepth(scan, self.config, kept_blocks=1)
-        z = matched.read(start, stop)[..., 0]
-        _open_array(f"{self.depth}/{DEPTH}")[start:stop] = z.numpy()
-        if self.with_sigma:
-            sigma = matched.read_sigma(start, stop)[..., 0]
-            _open_array(f"{self.depth}/{SIGMA}")[start:stop] = sigma.numpy()
-        return TaskResult(lines=stop - start, measured=int(torch.isfinite(z).sum()))
+        depth = depth_of(scan, self.config).read(start, stop)
+        _open_array(f"{self.depth}/{DEPTH}")[start:stop] = depth.z.numpy()
+        if self.with_sigma and depth.sigma is not None:
+            _open_array(f"{self.depth}/{SIGMA}")[start:stop] = depth.sigma.numpy()
+        return TaskResult(lines=stop - start, measured=int(torch.isfinite(depth.z).sum()))
 
 
 @dataclass(frozen=True)
@@ -114,14 +112,12 @@ class CorrectStrip:
     def run(self) -> TaskResult:
         """Correct the rows."""
         scan = _open_scan(self.scan)
-        depth, sigma = (scan.depth, None) if self.depth is None else _open_depth(self.depth)
-        if depth is None:
-            raise FileFormatError(scan.path, "its depth map is gone")
+        depth = depth_of(scan) if self.depth is None else _open_depth(self.depth)
         motion = Motion(*(torch.tensor(values, dtype=torch.float64) for values in (self.n, self.covariance)))
         grid = plan_product(scan, motion, self.config)
         first = self.number * self.config.strip_rows
         rows = first, min(first + self.config.strip_rows, grid.rows)
-        strip = correct_rows(scan, depth, motion, self.config, grid, rows, sigma)
+        strip = Correction(scan, depth, motion, self.config, grid).strip(rows)
         _open_product(self.product).write(strip.row, strip.color, strip.height, strip.valid, strip.source, strip.sigma)
         return TaskResult(lines=rows[1] - rows[0], measured=int(strip.valid.sum()))
 
@@ -245,10 +241,9 @@ def _open_scan(files: ScanFiles) -> Scan:
 
 
 @lru_cache(maxsize=2)
-def _open_depth(path: str) -> tuple[LineImage, LineImage | None]:
-    """Depth and its standard deviation, where that was asked for."""
+def _open_depth(path: str) -> StoredDepth:
     sigma = Path(path, SIGMA)
-    return open_line_image(Path(path, DEPTH)), open_line_image(sigma) if sigma.is_dir() else None
+    return StoredDepth(open_line_image(Path(path, DEPTH)), open_line_image(sigma) if sigma.is_dir() else None)
 
 
 # Opening costs as much as computing a small strip; a folder of one name is always laid out the same.

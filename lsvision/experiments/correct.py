@@ -7,6 +7,7 @@ from pathlib import Path
 
 from lsvision import __version__
 from lsvision.experiments.settings import RunSettings, settings_sha256
+from lsvision.geometry import ProductFrame
 from lsvision.image.tiling import keep_freed_memory
 from lsvision.io import (
     ExportFormat,
@@ -24,7 +25,7 @@ from lsvision.report.progress import ProgressBars, progress_bars
 from lsvision.stages.correction.config import CorrectionConfig
 from lsvision.stages.correction.correct import correct_scan
 from lsvision.stages.correction.grid import plan_product
-from lsvision.stages.correction.uncertainty import drift_per_metre, sigma_of
+from lsvision.stages.correction.uncertainty import drift_per_metre
 from lsvision.stages.disparity.config import DisparityConfig
 from lsvision.stages.disparity.depth import depth_of
 from lsvision.types import Motion, ProductGrid, Scan
@@ -63,7 +64,7 @@ class ProductSummary:
     valid_share: float
     lowest_mm: float
     highest_mm: float
-    drift_mm_per_m: tuple[float, float, float]
+    drift_mm_per_m: tuple[float, ...]
 
 
 def run_correct(settings: CorrectSettings, folder: Path) -> None:
@@ -107,7 +108,7 @@ def write_product(
     bar = bars.start(f"correct {target.stem}", total=grid.rows)
     valid, low, high = 0, float("inf"), float("-inf")
     with ProductWriter(target, layout) as writer:
-        for strip in correct_scan(scan, depth, motion, correction, grid, sigma_of(depth)):
+        for strip in correct_scan(scan, depth, motion, correction, grid):
             writer.write(strip.row, strip.color, strip.height, strip.valid, strip.source, strip.sigma)
             bars.advance(bar, strip.color.shape[0])
             if bool(strip.valid.any()):
@@ -133,7 +134,7 @@ def product_layout(
             "scan": str(scan.path),
             "version": __version__,
             "n": motion.n.tolist(),
-            "zero_disparity_mm": scan.rig.zero_disparity_mm,
+            "height_datum_mm": ProductFrame(scan.rig, scan.travel, motion.n).height_datum_mm,
             "attributes": dict(scan.attributes),
             **metadata,
         },

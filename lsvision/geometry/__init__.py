@@ -1,14 +1,35 @@
-"""Line cameras, triangulation, motion and rigid transforms: batched, differentiable, float64."""
+"""Line cameras, triangulation, motion, the product frame and rigid transforms: batched, differentiable, float64."""
 
-from lsvision.geometry.camera import depth_at, project, triangulate, triangulate_general, triangulation_jacobian
-from lsvision.geometry.motion import (
-    displace,
+from lsvision.geometry.camera import (
+    Camera,
+    CoplanarRig,
+    Intersection,
+    camera_center_mm,
+    depth_at,
+    depth_map_jacobian,
+    depth_sigma,
+    depth_step_mm,
+    disparity_at_height,
+    focal_length_px,
+    middle_point,
+    object_pitch_mm,
+    project,
+    scaled_rig,
+    slope_at,
+    triangulate,
+    triangulate_general,
+    triangulation_jacobian,
+    zero_disparity_mm,
+)
+from lsvision.geometry.motion import displace, line_at, scan_position, travel_at
+from lsvision.geometry.product import (
+    ProductFrame,
+    aligned_rotation,
     from_product,
-    line_at,
+    motion_sigma,
     product_axes,
-    scan_position,
+    product_pose,
     to_product,
-    travel_at,
 )
 from lsvision.geometry.rigid import (
     euler_angles,
@@ -20,17 +41,34 @@ from lsvision.geometry.rigid import (
 )
 
 __all__ = [
+    "Camera",
+    "CoplanarRig",
+    "Intersection",
+    "ProductFrame",
+    "aligned_rotation",
+    "camera_center_mm",
     "depth_at",
+    "depth_map_jacobian",
+    "depth_sigma",
+    "depth_step_mm",
+    "disparity_at_height",
     "displace",
     "euler_angles",
     "fit_rigid",
+    "focal_length_px",
     "from_product",
     "left_jacobian",
     "line_at",
+    "middle_point",
+    "motion_sigma",
+    "object_pitch_mm",
     "product_axes",
+    "product_pose",
     "project",
     "rotation_from_vector",
+    "scaled_rig",
     "scan_position",
+    "slope_at",
     "to_product",
     "transform",
     "travel_at",
@@ -38,4 +76,5 @@ __all__ = [
     "triangulate_general",
     "triangulation_jacobian",
     "vector_from_rotation",
+    "zero_disparity_mm",
 ]

@@ -1,7 +1,7 @@
-"""The motion of the object under the cameras: scan frame, travel, product frame.
+"""The motion of the object under the cameras: what a scan measures, and where it lies on the object.
 
 A point seen on line v, at (x, z) of the scan plane, lies at ``p = (x, 0, z) + y n`` with y = travel(v).
-Source: Wang et al. 2024, Eq. 10, 11 and 15; the product frame is ours.
+Source: Wang et al. 2024, Eq. 10, 11 and 15.
 """
 
 import torch
@@ -24,40 +24,6 @@ def scan_position(points: Float[Tensor, "*#batch 3"], n: Float[Tensor, "*#batch 
     """
     y = points[..., 1] / n[..., 1]
     return torch.stack([points[..., 0] - y * n[..., 0], y, points[..., 2] - y * n[..., 2]], dim=-1)
-
-
-def product_axes(n: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
-    """Rotation that takes scan-frame vectors to the product frame; its rows are e_x, e_y and e_z.
-
-    e_y is the direction of motion, e_z the viewing direction Z made orthogonal to it, e_x = e_y x e_z. So q_x and q_z
-    do not grow with the line number.
-    """
-    e_y = n / torch.linalg.vector_norm(n, dim=-1, keepdim=True)
-    z = torch.zeros_like(n)
-    z[..., 2] = 1.0
-    e_z = z - e_y[..., 2:3] * e_y
-    e_z = e_z / torch.linalg.vector_norm(e_z, dim=-1, keepdim=True)
-    e_x = torch.linalg.cross(e_y, e_z, dim=-1)
-    return torch.stack([e_x, e_y, e_z], dim=-2)
-
-
-def to_product(measured: Float[Tensor, "*#batch 3"], n: Float[Tensor, "*#batch 3"]) -> Float[Tensor, "*batch 3"]:
-    """Product coordinates q, mm, of measured (x, y = travel, z), mm.
-
-    Written per component, so that q_x and q_z stay exact however far the scan has travelled.
-    """
-    axes = product_axes(n)
-    e_x, e_y, e_z = axes[..., 0, :], axes[..., 1, :], axes[..., 2, :]
-    x, y, z = measured.unbind(-1)
-    q_x = x * e_x[..., 0] + z * e_x[..., 2]
-    q_y = torch.linalg.vector_norm(n, dim=-1) * y + x * e_y[..., 0] + z * e_y[..., 2]
-    q_z = x * e_z[..., 0] + z * e_z[..., 2]
-    return torch.stack([q_x, q_y, q_z], dim=-1)
-
-
-def from_product(product: Float[Tensor, "*#batch 3"], n: Float[Tensor, "*#batch 3"]) -> Float[Tensor, "*batch 3"]:
-    """Measured (x, y = travel, z), mm, of product coordinates q, mm: the inverse of ``to_product``."""
-    return scan_position((product_axes(n).mT @ product[..., None])[..., 0], n)
 
 
 def travel_at(travel: Travel, line: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:

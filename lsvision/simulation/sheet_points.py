@@ -8,13 +8,23 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lsvision.geometry import displace, fit_rigid, line_at, product_axes, project, scan_position, transform, travel_at
+from lsvision.geometry import (
+    displace,
+    fit_rigid,
+    line_at,
+    product_pose,
+    project,
+    scan_position,
+    slope_at,
+    transform,
+    travel_at,
+)
 from lsvision.image.brightness import gray
 from lsvision.image.planes import fit_local_planes
 from lsvision.simulation.artwork import artwork
 from lsvision.simulation.config import SceneConfig
 from lsvision.simulation.scan import Simulation
-from lsvision.types import LineImage, ProductGrid, Scan
+from lsvision.types import DepthSource, LineImage, ProductGrid, Scan, TensorImage
 
 _PATCH_PX = 12  # half the side of a patch that is looked for
 _SEARCH_PX = 8
@@ -41,7 +51,7 @@ class SheetPoints:
         return float((self.measured_mm - self.true_mm).square().sum(-1).mean().sqrt())
 
 
-def points_in_scan(scan: Scan, depth: LineImage, simulation: Simulation) -> SheetPoints:
+def points_in_scan(scan: Scan, depth: DepthSource, simulation: Simulation) -> SheetPoints:
     """The sheet as the scan shows it, taken at its nominal motion."""
     sheet, pose, n = sheet_grid(simulation.scene), simulation.pose, simulation.trajectory.n
     true = scan_position(transform(pose.rotation, pose.translation, sheet), n)
@@ -50,15 +60,16 @@ def points_in_scan(scan: Scan, depth: LineImage, simulation: Simulation) -> Shee
 
     def to_sheet(pixel: Tensor) -> Tensor:
         """Place on the sheet, mm, of a pixel of the scan."""
-        slope = (pixel[..., 0] - scan.rig.principal_left_px) / scan.rig.focal_length_px
+        slope = slope_at(scan.rig, pixel[..., 0])
         ray = torch.stack([slope, torch.zeros_like(slope), torch.ones_like(slope)], dim=-1)
         shifted = travel_at(scan.travel, pixel[..., 1])[..., None] * n - pose.translation
         z = -(shifted @ pose.rotation[:, 2]) / (ray @ pose.rotation[:, 2])
         return (shifted + z[..., None] * ray) @ pose.rotation
 
     found, seen = _find(gray(scan.left.read(0, scan.lines)), expected, to_sheet, simulation.scene)
-    z, _, known = fit_local_planes(depth, found, seen, (_DEPTH_WINDOW_PX, _DEPTH_WINDOW_PX))
-    slope = (found[:, 0] - scan.rig.principal_left_px) / scan.rig.focal_length_px
+    depth_map = TensorImage(depth.read(0, depth.lines).z[..., None])
+    z, _, known = fit_local_planes(depth_map, found, seen, (_DEPTH_WINDOW_PX, _DEPTH_WINDOW_PX))
+    slope = slope_at(scan.rig, found[:, 0])
     measured = displace(torch.stack([slope * z, travel_at(scan.travel, found[:, 1]), z], -1), n.new_tensor([0, 1, 0]))
     return _sheet_points(sheet, measured, found - expected, seen & known)
 
@@ -67,8 +78,8 @@ def points_in_product(
     color: LineImage, height: LineImage, grid: ProductGrid, n: Tensor, simulation: Simulation
 ) -> SheetPoints:
     """The sheet as the product shows it, made with a motion n."""
-    sheet, pose, axes = sheet_grid(simulation.scene), simulation.pose, product_axes(n)
-    rotation, translation = axes @ pose.rotation, axes @ pose.translation
+    sheet, pose = sheet_grid(simulation.scene), product_pose(simulation.pose, n)
+    rotation, translation = pose.rotation, pose.translation
     origin = n.new_tensor([grid.origin_x_mm, grid.origin_y_mm])
     expected = (transform(rotation, translation, sheet)[:, :2] - origin) / grid.pitch_mm
 

@@ -23,12 +23,12 @@ from lsvision.image.brightness import gray_bytes
 from lsvision.image.resampling import SAMPLED_TILES, Interpolation, Resampler, sample_images
 from lsvision.image.tiling import in_parallel, keep_freed_memory, tiles
 from lsvision.stages.correction.config import CorrectionConfig
-from lsvision.stages.correction.correct import correct_rows, correct_scan
+from lsvision.stages.correction.correct import Correction, correct_scan
 from lsvision.stages.correction.grid import plan_product
 from lsvision.stages.disparity.config import DisparityConfig
-from lsvision.stages.disparity.depth import MatchedDepth, depth_of
+from lsvision.stages.disparity.depth import depth_of
 from lsvision.stages.disparity.match import disparity_range
-from lsvision.types import Motion, Rig, Scan, Travel
+from lsvision.types import DepthView, Motion, Rig, Scan, StereoPair, Travel
 
 RIG = Rig(7142, 10.0, 113.84, 354.0, 1042.0, 6099.0)
 PITCH = 0.07
@@ -69,7 +69,7 @@ def surface_scan(lines: int) -> Scan:
     depth[:, 2500:4500] -= 20.0
     depth[:, 300:360] = torch.nan
     color = torch.randint(0, 256, (1024, RIG.width_px, 3), dtype=torch.uint8, generator=generator)
-    return Scan(Path("made"), RIG, Travel(PITCH), Repeated(color, lines), None, Repeated(depth[..., None], lines))
+    return Scan(Path("made"), RIG, Travel(PITCH), DepthView(Repeated(color, lines), Repeated(depth[..., None], lines)))
 
 
 def run() -> dict[str, object]:
@@ -103,14 +103,14 @@ def resampling_speeds() -> tuple[dict[str, float], dict[str, float], dict[str, f
     """Ours by interpolation and library, bare ``cv2.remap`` by interpolation, and the largest differences of both."""
     scan = surface_scan(2048)
     grid = plan_product(scan, MOTION, CONFIG)
-    strip = correct_rows(scan, scan.depth, MOTION, CONFIG, grid, (768, 768 + STRIP))
+    strip = Correction(scan, depth_of(scan), MOTION, CONFIG, grid).strip((768, 768 + STRIP))
     source = strip.source
     start = int(source[..., 0].nan_to_num(nan=1e9).min()) - 4
     stop = int(source[..., 0].nan_to_num(nan=0.0).max()) + 5
     line, column = source[..., 0] - start, source[..., 1].contiguous()
     filled = [values.nan_to_num(nan=8.0).numpy() for values in (column, line)]  # the peer knows no holes
     color = scan.left.read(start, stop)
-    height = (RIG.zero_disparity_mm - scan.depth.read(start, stop)).nan_to_num(nan=0.0)
+    height = (RIG.zero_disparity_mm - scan.images.depth.read(start, stop)).nan_to_num(nan=0.0)
 
     def ours(mode: Interpolation, resampler: Resampler) -> tuple[Tensor, Tensor]:
         made = torch.empty(*line.shape, 3, dtype=torch.uint8), torch.empty(*line.shape, 1)
@@ -150,7 +150,7 @@ def depth_map_speed() -> float:
     scan = surface_scan(LINES)
     grid = plan_product(scan, MOTION, CONFIG)
     begin = time.perf_counter()
-    for _ in correct_scan(scan, scan.depth, MOTION, CONFIG, grid):
+    for _ in correct_scan(scan, depth_of(scan), MOTION, CONFIG, grid):
         pass
     return grid.rows * grid.columns / (time.perf_counter() - begin) / 1e6
 
@@ -161,7 +161,7 @@ def stereo_scan(lines: int) -> Scan:
     texture = torch.randint(0, 256, (1024, RIG.width_px + 200, 3), dtype=torch.uint8, generator=generator)
     texture = torch.from_numpy(cv2.GaussianBlur(texture.numpy(), (0, 0), 1.5))
     left, right = (Repeated(texture[:, start : start + RIG.width_px].contiguous(), lines) for start in (100, 80))
-    return Scan(Path("made"), RIG, Travel(PITCH), left, right, None)
+    return Scan(Path("made"), RIG, Travel(PITCH), StereoPair(left, right))
 
 
 def scan_speeds() -> dict[str, float]:
@@ -171,14 +171,14 @@ def scan_speeds() -> dict[str, float]:
     """
     scan = stereo_scan(STEREO_LINES)
     grid = plan_product(scan, MOTION, CONFIG)
-    left, right = (image.read(0, 1024) for image in (scan.left, scan.right) if image is not None)
+    left, right = (image.read(0, 1024) for image in (scan.left, scan.images.right) if image is not None)
     maps = [values.astype(np.float32) + 0.3 for values in np.meshgrid(np.arange(7142.0), np.arange(1024.0))]
     gray = [gray_bytes(image).numpy() for image in (left, right)]
     low, high = disparity_range(RIG, MATCHING)
     count = high - low + 1 + -(high - low + 1) % 16
 
     def ours(resampler: Resampler) -> None:
-        for _ in correct_scan(scan, MatchedDepth(scan, MATCHING), MOTION, replace(CONFIG, resampler=resampler), grid):
+        for _ in correct_scan(scan, depth_of(scan, MATCHING), MOTION, replace(CONFIG, resampler=resampler), grid):
             pass
 
     def one_pass(mode: int) -> None:

@@ -13,7 +13,6 @@ from lsvision.archive import LEDGER_FILE, Ledger
 from lsvision.archive.tasks import CorrectStrip, HashInput, MatchStrip, run_task
 from lsvision.io import read_calibration, read_product, read_scan
 from lsvision.stages.correction.correct import correct_scan
-from lsvision.stages.correction.uncertainty import sigma_of
 from lsvision.stages.disparity.depth import depth_of
 from tests.archive.archives import (
     PROCESSING,
@@ -67,7 +66,7 @@ def test_uncertainty_is_that_of_the_bare_stages(archive, calibration, tmp_path):
     process(archive, calibration, tmp_path / "o", processing=processing)
     scan, motion = read_scan(archive / "b"), read_calibration(calibration).motion
     depth = depth_of(scan, PROCESSING.disparity)
-    strips = correct_scan(scan, depth, motion, processing.correction, depth_sigma=sigma_of(depth))
+    strips = correct_scan(scan, depth, motion, processing.correction)
     sigma = torch.cat([strip.sigma for strip in strips])
     assert bool(torch.isfinite(sigma).any())
     stored = np.moveaxis(zarr.open_array(tmp_path / "o" / "b.zarr" / "sigma" / "0", mode="r")[:], 0, -1)

@@ -12,7 +12,7 @@ from lsvision.experiments.settings import build_settings
 from lsvision.io import read_calibration, read_product, read_scan
 from lsvision.run import config_folder
 from lsvision.stages.measurement import measure_board
-from lsvision.types import Board, ProductGrid, TensorImage
+from lsvision.types import Board, DepthView, ProductGrid, TensorImage
 
 TILTS = {"a": (2.0, 1.5, 0.0), "b": (-5.0, 1.0, 6.0), "c": (4.0, -3.0, -8.0)}
 
@@ -88,7 +88,7 @@ def test_one_board_is_called_prior_dominated(scans, command, tmp_path, capsys):
 def test_a_depth_map_scan_calibrates_too(scans, command, tmp_path):
     options = ("scale=8", "scene.pitch_deg=2", "scene.roll_deg=1.5", "depth=true", f"output={tmp_path / 'depth'}")
     assert command("+experiment=simulate", *options) == 0
-    assert read_scan(tmp_path / "depth").right is None
+    assert isinstance(read_scan(tmp_path / "depth").images, DepthView)
     assert command("+experiment=calibrate", f"scans=[{tmp_path / 'depth'},{scans / 'b'},{scans / 'c'}]") == 0
     calibration = read_calibration(tmp_path / "run" / "calibration.json")
     assert calibration.rmse_after_mm < 0.06

@@ -103,7 +103,7 @@ def truncate(scan: Path) -> None:
 
 def one_line(scan: Path) -> None:
     read = read_scan(scan)
-    left, depth = [read.left.read(0, 1)], [read.depth.read(0, 1)]
+    left, depth = [read.left.read(0, 1)], [read.images.depth.read(0, 1)]
     write_scan(scan, rig=read.rig, travel=read.travel, left=left, right=None, depth=depth, lines=1)
 
 

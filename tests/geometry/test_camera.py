@@ -4,7 +4,14 @@ import pytest
 import torch
 from torch.func import jacrev, vmap
 
-from lsvision.geometry import project, triangulate, triangulate_general, triangulation_jacobian
+from lsvision.geometry import (
+    CoplanarRig,
+    Intersection,
+    project,
+    triangulate,
+    triangulate_general,
+    triangulation_jacobian,
+)
 from lsvision.types import Rig
 
 FULL = Rig(7142, 10.0, 113.84, 354.0, 1042.0, 6099.0)
@@ -23,26 +30,20 @@ def intersect(origin: torch.Tensor, first: torch.Tensor, second: torch.Tensor, b
     return origin + s * first
 
 
-def general(left_px: torch.Tensor, disparity_px: torch.Tensor) -> tuple[torch.Tensor, ...]:
+def general(left_px: torch.Tensor, disparity_px: torch.Tensor) -> Intersection:
     """The rectified rig seen as a general one: columns count towards larger X, image coordinates the other way."""
     left_mm = -(left_px - FULL.principal_left_px) * FULL.pixel_pitch_um * 1e-3
     right_mm = -(left_px - disparity_px - FULL.principal_right_px) * FULL.pixel_pitch_um * 1e-3
-    return triangulate_general(
-        left_mm,
-        right_mm,
-        focal_left_mm=FULL.focal_length_mm,
-        focal_right_mm=FULL.focal_length_mm,
-        baseline_mm=FULL.baseline_mm,
-        alpha=0.0,
-        beta=math.pi / 2,
-    )
+    rig = CoplanarRig(FULL.focal_length_mm, FULL.focal_length_mm, FULL.baseline_mm, alpha=0.0, beta=math.pi / 2)
+    return triangulate_general(left_mm, right_mm, rig)
 
 
 def test_batch_equals_loop() -> None:
     left, disparity = pixels(2, 3)
     batched = torch.stack(triangulate(FULL, left, disparity))
     jacobian = triangulation_jacobian(FULL, left, disparity)
-    points, depth, _ = general(left, disparity)
+    whole = general(left, disparity)
+    points, depth = whole.points, whole.depth_mm
     seen = torch.stack(project(FULL, *batched))
     for i in range(2):
         for j in range(3):
@@ -50,8 +51,8 @@ def test_batch_equals_loop() -> None:
             assert torch.equal(batched[:, i, j], torch.stack(triangulate(FULL, *one)))
             assert torch.equal(jacobian[i, j], triangulation_jacobian(FULL, *one))
             assert torch.equal(seen[:, i, j], torch.stack(project(FULL, *batched[:, i, j])))
-            torch.testing.assert_close(points[i, j], general(*one)[0], rtol=1e-14, atol=0)
-            torch.testing.assert_close(depth[i, j], general(*one)[1], rtol=1e-14, atol=0)
+            torch.testing.assert_close(points[i, j], general(*one).points, rtol=1e-14, atol=0)
+            torch.testing.assert_close(depth[i, j], general(*one).depth_mm, rtol=1e-14, atol=0)
 
 
 def test_default_rig_of_table_1() -> None:
@@ -92,7 +93,8 @@ def test_projection_inverts_triangulation() -> None:
 def test_both_forms_agree_with_intersected_rays_on_a_rectified_rig() -> None:
     left, disparity = pixels(200)
     x, z = triangulate(FULL, left, disparity)
-    points, depth, valid = general(left, disparity)
+    met = general(left, disparity)
+    points, depth, valid = met.points, met.depth_mm, met.valid
     assert valid.all()
     torch.testing.assert_close(points, torch.stack([x, z], -1), rtol=0, atol=1e-9)
     torch.testing.assert_close(depth + FULL.focal_length_mm, z, rtol=0, atol=1e-9)
@@ -110,15 +112,9 @@ def test_general_form_meets_intersected_rays_at_any_angle() -> None:
     for i in range(count):
         alpha, beta = 0.3 + 0.5 * float(alphas[i]), 1.0 + 0.6 * float(betas[i])
         focal_left, focal_right = 90.0, 110.0
-        points, depth, valid = triangulate_general(
-            left_mm[i],
-            right_mm[i],
-            focal_left_mm=focal_left,
-            focal_right_mm=focal_right,
-            baseline_mm=354.0,
-            alpha=alpha,
-            beta=beta,
-        )
+        rig = CoplanarRig(focal_left, focal_right, 354.0, alpha, beta)
+        met = triangulate_general(left_mm[i], right_mm[i], rig)
+        points, depth, valid = met.points, met.depth_mm, met.valid
         # A sensor behind the lens, turned with its axis: the ray leaves through the lens, opposite to the pixel.
         left_axis = torch.tensor([math.cos(beta), math.sin(beta)], dtype=torch.float64)
         right_axis = torch.tensor([math.cos(beta + alpha), math.sin(beta + alpha)], dtype=torch.float64)
@@ -137,7 +133,8 @@ def test_parallel_rays_and_points_behind_are_nan_beside_good_ones() -> None:
     left = torch.full((4,), 1042.0, dtype=torch.float64)
     disparity = torch.tensor([0.0, parallel, parallel - 100.0, torch.nan], dtype=torch.float64)
     x, z = triangulate(FULL, left, disparity)
-    points, depth, valid = general(left, disparity)
+    met = general(left, disparity)
+    points, depth, valid = met.points, met.depth_mm, met.valid
     assert valid.tolist() == [True, False, False, False]
     for result in (x, z, depth, points[:, 0], points[:, 1]):
         assert result.isfinite().tolist() == [True, False, False, False]

@@ -40,7 +40,7 @@ def sample(image: LineImage, line: Tensor, column: Tensor) -> Tensor:
 @pytest.mark.parametrize("side", ["left", "right"])
 def test_corners_stand_where_dark_and_light_squares_meet(shared_data: Path, name: str, side: str) -> None:
     scan = read_scan(shared_data / "scans_other_renderer" / name)
-    image = scan.left if side == "left" else scan.right
+    image = scan.left if side == "left" else scan.images.right
     corners = BOARD.corner_points()
     quadrants = {}
     for across in (-1.0, 1.0):

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from lsvision.geometry import scan_position, transform
 from lsvision.simulation import EncoderConfig, MotionConfig, SceneConfig, SensorConfig, Simulation, scaled_rig, simulate
-from lsvision.types import Board, Rig, Scan, TensorImage, Transport
+from lsvision.types import Board, DepthView, Rig, Scan, StereoPair, TensorImage, Transport
 
 FULL_RIG = Rig(7142, 10.0, 113.84, 354.0, 1042.0, 6099.0)
 SMALL_RIG = scaled_rig(FULL_RIG, 16)
@@ -28,14 +28,14 @@ def simulation(
 def stereo_scan(source: Simulation) -> Scan:
     """The scan with both its images."""
     left, right = (TensorImage(torch.cat(list(source.strips(camera)))) for camera in ("left", "right"))
-    return Scan(Path("rendered"), source.rig, source.travel, left, right, None)
+    return Scan(Path("rendered"), source.rig, source.travel, StereoPair(left, right))
 
 
 def depth_scan(source: Simulation) -> Scan:
     """The scan as a camera that computes depth itself would store it."""
     left = TensorImage(torch.cat(list(source.strips("left"))))
     depth = TensorImage(torch.cat(list(source.depth_strips()))[..., None])
-    return Scan(Path("rendered"), source.rig, source.travel, left, None, depth)
+    return Scan(Path("rendered"), source.rig, source.travel, DepthView(left, depth))
 
 
 def true_measurement(source: Simulation) -> Tensor:

@@ -13,18 +13,18 @@ from lsvision.stages.correction.grid import plan_product
 from lsvision.stages.disparity.config import DisparityConfig
 from lsvision.stages.disparity.depth import depth_of
 from lsvision.stages.measurement import BoardMeasurement, distance_errors, measure_board
-from lsvision.types import Board, LineImage, Motion, Scan, TensorImage
+from lsvision.types import Board, Motion, Scan, TensorImage
 from tests.stages.other_renderer import tilt_corners, tilt_scans, true_motion
 from tests.stages.rendered import BOARD, depth_scan, simulation
 
 NOMINAL = Motion(torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64), torch.zeros(3, 3, dtype=torch.float64))
 
 
-def measured(scan: Scan, depth: LineImage, motion: Motion) -> BoardMeasurement | None:
+def measured(scan: Scan, motion: Motion, matching: DisparityConfig | None = None) -> BoardMeasurement | None:
     """Correct a whole scan and measure the board in the product."""
     config = CorrectionConfig()
     grid = plan_product(scan, motion, config)
-    strips = list(correct_scan(scan, depth, motion, config, grid))
+    strips = list(correct_scan(scan, depth_of(scan, matching), motion, config, grid))
     color, height = torch.cat([s.color for s in strips]), torch.cat([s.height for s in strips])
     return measure_board(TensorImage(color), TensorImage(height[..., None]), grid, BOARD)
 
@@ -53,7 +53,7 @@ def test_a_pose_changes_no_distance():
 def test_a_rendered_board_keeps_its_size():
     source = simulation()
     scan, motion = depth_scan(source), Motion(source.trajectory.n, NOMINAL.covariance)
-    corrected, nominal = measured(scan, scan.depth, motion), measured(scan, scan.depth, NOMINAL)
+    corrected, nominal = measured(scan, motion), measured(scan, NOMINAL)
     assert corrected.valid.all()
     assert corrected.neighbour_rms_mm < 0.05
     assert corrected.distance_rms_mm < 0.05
@@ -75,8 +75,8 @@ def test_chain_on_another_renderer(shared_data: Path):
     assert calibration.rmse_after_mm <= 0.04
     assert calibration.observability.verdict == "determined"
     scan = scans[1]
-    depth = TensorImage(depth_of(scan, DisparityConfig(height_range_mm=(-60.0, 60.0))).read(0, scan.lines))
-    corrected, nominal = measured(scan, depth, calibration.motion), measured(scan, depth, NOMINAL)
+    wide = DisparityConfig(height_range_mm=(-60.0, 60.0))
+    corrected, nominal = measured(scan, calibration.motion, wide), measured(scan, NOMINAL, wide)
     assert corrected.valid.all()
     assert corrected.distance_rms_mm <= 0.04
     assert nominal.distance_rms_mm > 1.0

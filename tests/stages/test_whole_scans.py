@@ -12,7 +12,8 @@ from lsvision.io import read_encoder
 from lsvision.stages.correction.config import CorrectionConfig
 from lsvision.stages.correction.correct import correct_scan
 from lsvision.stages.correction.grid import plan_product
-from lsvision.types import Motion, Rig, Scan, TensorImage, Travel
+from lsvision.stages.disparity.depth import depth_of
+from lsvision.types import DepthView, Motion, Rig, Scan, TensorImage, Travel
 
 PITCH = 0.56
 # An eighth of the camera's pixels, and a field of two tiles.
@@ -37,11 +38,11 @@ def rough_scan(travel: Travel, rig: Rig = RIG, dtype: torch.dtype = torch.uint8,
     depth[torch.rand(depth.shape) < 0.01] = torch.nan
     top = torch.iinfo(dtype).max
     color = torch.randint(0, top + 1, (LINES, rig.width_px, channels)).to(dtype)
-    return Scan(Path("rough"), rig, travel, TensorImage(color), None, TensorImage(depth.float()[..., None]))
+    return Scan(Path("rough"), rig, travel, DepthView(TensorImage(color), TensorImage(depth.float()[..., None])))
 
 
 def product(scan: Scan, config: CorrectionConfig, motion: Motion = ASKEW) -> dict[str, Tensor]:
-    strips = list(correct_scan(scan, scan.depth, motion, config))
+    strips = list(correct_scan(scan, depth_of(scan), motion, config))
     return {part: torch.cat([getattr(strip, part) for strip in strips]) for part in PARTS}
 
 
@@ -106,13 +107,14 @@ def test_mono_and_sixteen_bit_scans(dtype, channels):
     assert made["color"].shape[2] == channels
     assert made["color"].int().max() > 0.9 * torch.iinfo(dtype).max
     # Colour does not move anything.
-    colored = product(dataclasses.replace(scan, left=rough_scan(Travel(PITCH)).left), CONFIG)
+    images = DepthView(rough_scan(Travel(PITCH)).left, scan.images.depth)
+    colored = product(dataclasses.replace(scan, images=images), CONFIG)
     assert torch.equal(colored["source"].nan_to_num(nan=-1.0), made["source"].nan_to_num(nan=-1.0))
 
 
 def test_depths_out_of_range_are_not_measured():
     scan = rough_scan(Travel(PITCH))
-    scan.depth.tensor[200:300, 400:600] = 700.0
+    scan.images.depth.tensor[200:300, 400:600] = 700.0
     made = product(scan, CONFIG)
     assert float(made["height"].nan_to_num().max()) < 30.0
     line, column = made["source"].unbind(-1)
@@ -121,7 +123,8 @@ def test_depths_out_of_range_are_not_measured():
 
 def test_a_scan_of_one_line_is_refused():
     scan = rough_scan(Travel(PITCH))
-    short = dataclasses.replace(scan, left=TensorImage(scan.left.tensor[:1]), depth=TensorImage(scan.depth.tensor[:1]))
+    images = DepthView(TensorImage(scan.left.tensor[:1]), TensorImage(scan.images.depth.tensor[:1]))
+    short = dataclasses.replace(scan, images=images)
     with pytest.raises(FileFormatError, match="rough: expected at least two lines"):
         plan_product(short, ASKEW, CONFIG)
 
@@ -131,7 +134,7 @@ def object_scan(position: Tensor, travel: Travel) -> Scan:
     shade = (position / PITCH * 100).round().to(torch.int32).clamp(0, 65535).to(torch.uint16)
     color = shade[:, None, None].expand(-1, RIG.width_px, 1)
     depth = torch.full((len(position), RIG.width_px, 1), 796.9)
-    return Scan(Path("object"), RIG, travel, TensorImage(color), None, TensorImage(depth))
+    return Scan(Path("object"), RIG, travel, DepthView(TensorImage(color), TensorImage(depth)))
 
 
 def test_an_encoder_log_with_a_halt_a_way_back_a_gap_and_another_pitch(tmp_path):

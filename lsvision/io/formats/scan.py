@@ -16,7 +16,7 @@ from lsvision.io.formats.rig import read_rig, write_rig
 from lsvision.io.formats.validation import Fields, read_yaml
 from lsvision.io.images.line_image import open_line_image
 from lsvision.io.images.tiff import write_line_image
-from lsvision.types import LineImage, Rig, Scan, Transport, Travel
+from lsvision.types import DepthView, LineImage, Rig, Scan, StereoPair, Transport, Travel
 
 SCAN_FORMAT = "lsvision-scan/1"
 SCAN_FILE = "scan.yaml"
@@ -47,9 +47,10 @@ def read_scan(path: Path | str, *, repair_encoder: bool = False) -> Scan:
     fields.finish()
     _check_images(fields, rig, images)
     left = images["left"]
+    pair = StereoPair(left, images["right"]) if "right" in images else DepthView(left, images["depth"])
     positions_mm = read_encoder(encoder, left.shape[0], repair=repair_encoder) if encoder else None
     travel = Travel(line_pitch_mm, positions_mm, cast(Transport, transport))
-    return Scan(file.parent, rig, travel, left, images.get("right"), images.get("depth"), color_registered, attributes)
+    return Scan(file.parent, rig, travel, pair, color_registered, attributes)
 
 
 def write_scan(

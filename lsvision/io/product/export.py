@@ -27,7 +27,7 @@ def export_product(product: Product, kind: ExportFormat, base: Path) -> list[Pat
         The files written.
 
     Raises:
-        FileFormatError: the product does not tell its plane of zero disparity. ConfigError: laspy is not installed.
+        FileFormatError: the product's metadata lack the datum of its heights. ConfigError: laspy is not installed.
     """
     if kind == "tiff":
         return _write_images(product, base)
@@ -51,16 +51,19 @@ def _write_images(product: Product, base: Path) -> list[Path]:
 
 def _points(product: Product) -> Iterator[tuple[Tensor, Tensor]]:
     """Points, mm, and their colours of eight bits, some rows at a time."""
-    z0 = product.metadata.get("zero_disparity_mm")
-    if not isinstance(z0, float):
-        raise FileFormatError(product.path, f"expected a number, got {z0!r}", "lsvision.zero_disparity_mm")
+    # Products of version 0.1 count heights from the depth of zero disparity itself.
+    datum_mm = product.metadata.get("height_datum_mm", product.metadata.get("zero_disparity_mm"))
+    if not isinstance(datum_mm, float):
+        raise FileFormatError(product.path, f"expected a number, got {datum_mm!r}", "lsvision.height_datum_mm")
     (origin_y, origin_x), (rows, columns) = product.origin_mm, product.shape
     q_x = origin_x + product.pitch_mm * torch.arange(columns, dtype=torch.float64)
     for row in range(0, rows, _ROWS):
         stop = min(row + _ROWS, rows)
         height, valid, color = product.height(row, stop), product.valid(row, stop), product.color(row, stop)
         q_y = origin_y + product.pitch_mm * torch.arange(row, stop, dtype=torch.float64)
-        places = torch.stack([q_x.expand(valid.shape), q_y[:, None].expand(valid.shape), z0 - height.double()], dim=-1)
+        places = torch.stack(
+            [q_x.expand(valid.shape), q_y[:, None].expand(valid.shape), datum_mm - height.double()], dim=-1
+        )
         if color.dtype == torch.uint16:
             color = (color.to(torch.int32) // 257).to(torch.uint8)
         yield places[valid], color.expand(*valid.shape, 3)[valid]

@@ -1,14 +1,33 @@
-"""Scan -> Corners: the board's corners in both images, as measured (x, travel, z) with covariance."""
+"""Scan -> corners: the board's corners in both images, as measured (x, travel, z) with covariance."""
+
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from lsvision.errors import BoardNotFoundError
-from lsvision.geometry import travel_at, triangulate, triangulation_jacobian
+from lsvision.geometry import (
+    depth_map_jacobian,
+    object_pitch_mm,
+    slope_at,
+    travel_at,
+    triangulate,
+    triangulation_jacobian,
+)
 from lsvision.image.board.detect import DetectedCorners, detect_board
 from lsvision.image.planes import fit_local_planes
 from lsvision.stages.corners.config import CornersConfig
-from lsvision.types import Board, BoardCorners, LineImage, Scan, Travel
+from lsvision.types import Board, BoardCorners, DepthView, LineImage, Scan, StereoPair, Travel
+
+
+@dataclass(frozen=True)
+class _Measured:
+    """Corners as measured: (x, travel, z) mm, their covariance, mm², and which were seen."""
+
+    points: Tensor
+    covariance: Tensor
+    valid: Tensor
+    right_px: Tensor | None = None
 
 
 def find_corners(scan: Scan, board: Board, config: CornersConfig | None = None) -> BoardCorners:
@@ -22,14 +41,12 @@ def find_corners(scan: Scan, board: Board, config: CornersConfig | None = None) 
     """
     config = config or CornersConfig()
     left = _detect(scan, scan.left, "left", board)
-    if scan.right is not None:
-        right = _detect(scan, scan.right, "right", board)
-        points, covariance, valid = _triangulated(scan, left, right, config)
-        right_px = right.position
-    else:
-        assert scan.depth is not None  # a Scan has one or the other
-        points, covariance, valid = _from_depth_map(scan, left, scan.depth, config)
-        right_px = None
+    match scan.images:
+        case StereoPair(_, right_image):
+            measured = _triangulated(scan, left, _detect(scan, right_image, "right", board), config)
+        case DepthView(_, depth):
+            measured = _from_depth_map(scan, left, depth, config)
+    valid = measured.valid
     if int(valid.sum()) < config.min_corners:
         raise BoardNotFoundError(
             f"{scan.path}: only {int(valid.sum())} of {len(valid)} corners of the board were measured, "
@@ -37,12 +54,12 @@ def find_corners(scan: Scan, board: Board, config: CornersConfig | None = None) 
         )
     return BoardCorners(
         scan=str(scan.path),
-        points=torch.where(valid[:, None], points, torch.nan),
-        covariance=torch.where(valid[:, None, None], covariance, torch.nan),
+        points=torch.where(valid[:, None], measured.points, torch.nan),
+        covariance=torch.where(valid[:, None, None], measured.covariance, torch.nan),
         valid=valid,
         board_points=board.corner_points(),
         left_px=left.position,
-        right_px=right_px,
+        right_px=measured.right_px,
     )
 
 
@@ -53,10 +70,8 @@ def _detect(scan: Scan, image: LineImage, side: str, board: Board) -> DetectedCo
     return detected
 
 
-def _triangulated(
-    scan: Scan, left: DetectedCorners, right: DetectedCorners, config: CornersConfig
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Points and covariance from the columns of both images and the mean of both lines, weighted by their variance."""
+def _triangulated(scan: Scan, left: DetectedCorners, right: DetectedCorners, config: CornersConfig) -> _Measured:
+    """From the columns of both images and the mean of both lines, weighted by their variance."""
     valid = left.valid & right.valid
     valid &= (left.position[:, 1] - right.position[:, 1]).abs() <= config.max_line_difference
     u_left, u_right = left.position[:, 0], right.position[:, 0]
@@ -66,40 +81,35 @@ def _triangulated(
     line = weight * left.position[:, 1] + (1 - weight) * right.position[:, 1]
     points = torch.stack([x, travel_at(scan.travel, line), z], dim=-1)
 
-    # Rows x, y, z by columns u_left, v_left, u_right, v_right.
-    by_columns = triangulation_jacobian(scan.rig, u_left, u_left - u_right)
-    by_left, by_right = by_columns.sum(-1), -by_columns[..., 1]
     pitch = _pitch_at(scan.travel, line)
-    zero = torch.zeros_like(x)
-    jacobian_left = torch.stack(
-        [torch.stack([by_left[:, 0], zero, by_left[:, 1]], -1), torch.stack([zero, pitch * weight, zero], -1)], -1
-    )
-    jacobian_right = torch.stack(
-        [torch.stack([by_right[:, 0], zero, by_right[:, 1]], -1), torch.stack([zero, pitch * (1 - weight), zero], -1)],
-        -1,
-    )
-    covariance = jacobian_left @ left.covariance @ jacobian_left.mT
-    covariance = covariance + jacobian_right @ right.covariance @ jacobian_right.mT
-    return points, covariance, valid & torch.isfinite(points).all(-1)
+    by_columns = triangulation_jacobian(scan.rig, u_left, u_left - u_right)
+    by_left = _point_jacobian(by_columns.sum(-1), pitch * weight)
+    by_right = _point_jacobian(-by_columns[..., 1], pitch * (1 - weight))
+    covariance = by_left @ left.covariance @ by_left.mT
+    covariance = covariance + by_right @ right.covariance @ by_right.mT
+    return _Measured(points, covariance, valid & torch.isfinite(points).all(-1), right.position)
 
 
-def _from_depth_map(
-    scan: Scan, left: DetectedCorners, depth: LineImage, config: CornersConfig
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Points and covariance from one image and a depth map: z of a plane fitted around each corner."""
-    pitch = _pitch_at(scan.travel, left.position[:, 1])
-    half_columns = max(2, round(config.depth_window_mm / 2 / scan.rig.object_pitch_mm))
+def _from_depth_map(scan: Scan, left: DetectedCorners, depth: LineImage, config: CornersConfig) -> _Measured:
+    """From one image and a depth map: z of a plane fitted around each corner."""
+    column, line = left.position.unbind(-1)
+    half_columns = max(2, round(config.depth_window_mm / 2 / object_pitch_mm(scan.rig)))
     half_lines = max(2, round(config.depth_window_mm / 2 / abs(scan.travel.line_pitch_mm)))
     z, variance, seen = fit_local_planes(depth, left.position, left.valid, (half_columns, half_lines))
-    slope = (left.position[:, 0] - scan.rig.principal_left_px) / scan.rig.focal_length_px
-    points = torch.stack([slope * z, travel_at(scan.travel, left.position[:, 1]), z], dim=-1)
-    zero, one = torch.zeros_like(z), torch.ones_like(z)
-    by_pixel = torch.stack(
-        [torch.stack([z / scan.rig.focal_length_px, zero, zero], -1), torch.stack([zero, pitch, zero], -1)], -1
-    )
-    by_depth = torch.stack([slope, zero, one], -1)[..., None]
+    slope = slope_at(scan.rig, column)
+    points = torch.stack([slope * z, travel_at(scan.travel, line), z], dim=-1)
+    by_column_and_depth = depth_map_jacobian(scan.rig, column, z)
+    by_pixel = _point_jacobian(by_column_and_depth[..., 0], _pitch_at(scan.travel, line))
+    by_depth = torch.stack([slope, torch.zeros_like(z), torch.ones_like(z)], -1)[..., None]
     covariance = by_pixel @ left.covariance @ by_pixel.mT + by_depth @ by_depth.mT * variance[:, None, None]
-    return points, covariance, left.valid & seen
+    return _Measured(points, covariance, left.valid & seen)
+
+
+def _point_jacobian(x_z_by_column: Tensor, y_by_line: Tensor) -> Tensor:
+    """Derivative (corners, 3, 2) of (x, y, z) by (column, line) of one image."""
+    zero = torch.zeros_like(y_by_line)
+    by_column = torch.stack([x_z_by_column[:, 0], zero, x_z_by_column[:, 1]], -1)
+    return torch.stack([by_column, torch.stack([zero, y_by_line, zero], -1)], -1)
 
 
 def _pitch_at(travel: Travel, line: Tensor) -> Tensor:

@@ -1,63 +1,51 @@
-"""Disparity -> depth: the depth map of a stereo scan, matched where it is read."""
+"""Disparity -> depth: the depth of a stereo scan, matched where it is read."""
 
 from collections import OrderedDict
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Literal
 
 import torch
-from torch import Tensor
 
-from lsvision.geometry import depth_at
+from lsvision.geometry import depth_at, depth_sigma
 from lsvision.image.brightness import white_level
 from lsvision.stages.disparity.config import DisparityConfig
 from lsvision.stages.disparity.match import measure_block
-from lsvision.types import LineImage, Rig, Scan
-
-
-def depth_sigma(depth: Tensor, sigma: Tensor, rig: Rig) -> Tensor:
-    """Standard deviation of depths, mm, from that of their disparities, px: ``dz/dd = -z² / (f B)``."""
-    return depth.square() * (sigma / (rig.focal_length_px * rig.baseline_mm))
+from lsvision.types import Depth, DepthSource, DepthView, Rig, Scan, StereoPair, StoredDepth
 
 
 @dataclass
 class MatchedDepth:
-    """The depth map of a stereo scan as a ``LineImage``: float32 z in mm, NaN for none, matched where it is read.
+    """The depth of a stereo scan; the last blocks stay in memory, since neighbouring reads overlap.
 
-    The last blocks stay in memory, since neighbouring reads overlap.
+    The sigma is None where the matcher does not refine: nothing is known about it then.
     """
 
-    scan: Scan
+    images: StereoPair
+    rig: Rig
     config: DisparityConfig = field(default_factory=DisparityConfig)
     kept_blocks: int = 3
-    _blocks: OrderedDict[int, tuple[Tensor, Tensor]] = field(default_factory=OrderedDict, init=False, repr=False)
+    _blocks: OrderedDict[int, Depth] = field(default_factory=OrderedDict, init=False, repr=False)
 
     @property
-    def shape(self) -> tuple[int, int, int]:
-        """(lines, width, 1)."""
-        return self.scan.lines, self.scan.rig.width_px, 1
+    def lines(self) -> int:
+        """Number of lines of the scan."""
+        return self.images.left.shape[0]
 
-    @property
-    def dtype(self) -> torch.dtype:
-        """float32."""
-        return torch.float32
-
-    def read(self, start: int, stop: int) -> Tensor:
-        """Depth of lines ``start..stop-1``, ``(stop - start, width, 1)`` in mm."""
-        return self._read(start, stop, 0)
-
-    def read_sigma(self, start: int, stop: int) -> Tensor:
-        """Standard deviation of the depth of lines ``start..stop-1``, ``(stop - start, width, 1)`` in mm."""
-        return self._read(start, stop, 1)
-
-    def _read(self, start: int, stop: int, which: Literal[0, 1]) -> Tensor:
+    def read(self, start: int, stop: int) -> Depth:
+        """Depth of lines ``start..stop-1``."""
         size = self.config.block_lines
         first, last = start // size, (stop - 1) // size
-        blocks = [self._block(index)[which] for index in range(first, last + 1)]
+        blocks = [self._block(index) for index in range(first, last + 1)]
         lines = slice(start - first * size, stop - first * size)
-        return (blocks[0] if len(blocks) == 1 else torch.cat(blocks))[lines, :, None]
+        if len(blocks) == 1:
+            z, sigma = blocks[0].z, blocks[0].sigma
+        else:
+            z = torch.cat([block.z for block in blocks])
+            sigmas = [block.sigma for block in blocks if block.sigma is not None]
+            sigma = torch.cat(sigmas) if sigmas else None
+        return Depth(z[lines], None if sigma is None else sigma[lines])
 
-    def _block(self, index: int) -> tuple[Tensor, Tensor]:
+    def _block(self, index: int) -> Depth:
         if index not in self._blocks:
             self._blocks[index] = self._match(index)
             while len(self._blocks) > self.kept_blocks:
@@ -67,17 +55,18 @@ class MatchedDepth:
 
     @cached_property
     def _white(self) -> float:
-        assert self.scan.right is not None
-        return white_level(self.scan.left, self.scan.right)
+        return white_level(self.images.left, self.images.right)
 
-    def _match(self, index: int) -> tuple[Tensor, Tensor]:
-        """Depth and its standard deviation, each (lines, width)."""
-        assert self.scan.right is not None
-        match = measure_block(self.scan.left, self.scan.right, self.scan.rig, self.config, self._white, index)
-        depth = depth_at(self.scan.rig, match.disparity)
-        return depth, depth_sigma(depth, match.sigma, self.scan.rig)
+    def _match(self, index: int) -> Depth:
+        match = measure_block(self.images.left, self.images.right, self.rig, self.config, self._white, index)
+        z = depth_at(self.rig, match.disparity)
+        return Depth(z, depth_sigma(self.rig, z, match.sigma) if self.config.tells_sigma else None)
 
 
-def depth_of(scan: Scan, config: DisparityConfig) -> LineImage:
-    """The scan's own depth map where a camera computed one, else the one matched from its two images."""
-    return scan.depth if scan.depth is not None else MatchedDepth(scan, config)
+def depth_of(scan: Scan, config: DisparityConfig | None = None) -> DepthSource:
+    """The scan's own depth map where its camera computed one, else the one matched from its two images."""
+    match scan.images:
+        case DepthView(_, depth):
+            return StoredDepth(depth)
+        case StereoPair() as pair:
+            return MatchedDepth(pair, scan.rig, config or DisparityConfig())

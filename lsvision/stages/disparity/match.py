@@ -7,6 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from lsvision.geometry import disparity_at_height
 from lsvision.image.brightness import gray, gray_bytes, white_level
 from lsvision.image.stereo.agreement import occluded
 from lsvision.image.stereo.coarse_to_fine import match_coarse_to_fine
@@ -33,9 +34,7 @@ class StripMatch:
 
 def disparity_range(rig: Rig, config: DisparityConfig) -> tuple[int, int]:
     """Lowest and highest disparity, px, that the configured heights ask for on a rig."""
-    convergence = rig.principal_right_px - rig.principal_left_px
-    z0 = rig.zero_disparity_mm
-    low, high = (convergence * (z0 / (z0 - height) - 1) for height in config.height_range_mm)
+    low, high = (disparity_at_height(rig, height) for height in config.height_range_mm)
     return math.floor(low), math.ceil(high)
 
 

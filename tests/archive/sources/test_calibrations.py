@@ -8,7 +8,7 @@ import torch
 
 from lsvision.archive import calibration_for, read_calibrations
 from lsvision.errors import CalibrationError, FileFormatError
-from lsvision.types import Scan, TensorImage, Travel
+from lsvision.types import DepthView, Scan, TensorImage, Travel
 from tests.archive.archives import RIG, make_calibration
 
 OTHER_RIG = dataclasses.replace(RIG, baseline_mm=300.0)
@@ -16,7 +16,7 @@ IMAGE = TensorImage(torch.zeros(2, RIG.width_px, 1))
 
 
 def scan_of(rig=RIG, **attributes: str) -> Scan:
-    return Scan(Path("scan"), rig, Travel(1.0), IMAGE, None, IMAGE, attributes=attributes)
+    return Scan(Path("scan"), rig, Travel(1.0), DepthView(IMAGE, IMAGE), attributes=attributes)
 
 
 @pytest.fixture

@@ -222,7 +222,7 @@ def test_a_long_image_is_read_in_parts():
 def test_boards_of_another_renderer(shared_data: Path, name: str):
     scan = read_scan(shared_data / "scans_other_renderer" / name)
     board = Board(12, 9, 30.0)
-    for image, truth in zip((scan.left, scan.right), true_corners(scan, board), strict=True):
+    for image, truth in zip((scan.left, scan.images.right), true_corners(scan, board), strict=True):
         detected = detect_board(image, board)
         assert detected is not None
         assert detected.valid.all()

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from lsvision.errors import FileFormatError
 from lsvision.io import read_scan, write_line_image, write_rig
-from lsvision.types import Rig, Travel
+from lsvision.types import DepthView, Rig, Travel
 
 MakeScan = Callable[..., Path]
 
@@ -28,8 +28,8 @@ def test_round_trip(make_scan: MakeScan, small_rig: Rig, images) -> None:
     assert scan.travel == Travel(0.56)
     assert scan.lines == 300
     assert torch.equal(scan.left.read(0, 300), images[0])
-    assert torch.equal(scan.right.read(0, 300), images[1])
-    assert (scan.depth, scan.color_registered, scan.attributes) == (None, True, {})
+    assert torch.equal(scan.images.right.read(0, 300), images[1])
+    assert (scan.color_registered, scan.attributes) == (True, {})
 
 
 def test_everything_optional(make_scan: MakeScan, small_rig: Rig) -> None:
@@ -46,8 +46,8 @@ def test_everything_optional(make_scan: MakeScan, small_rig: Rig) -> None:
     scan = read_scan(folder)
     assert torch.equal(scan.travel.positions_mm, positions)
     assert scan.travel.transport == "reverse"
-    assert scan.right is None
-    torch.testing.assert_close(scan.depth.read(0, 300), depth, rtol=0, atol=0, equal_nan=True)
+    assert isinstance(scan.images, DepthView)
+    torch.testing.assert_close(scan.images.depth.read(0, 300), depth, rtol=0, atol=0, equal_nan=True)
     assert scan.attributes == {"rail": "A-1234", "heat": "0042", "Schicht": "früh"}
     assert not scan.color_registered
     assert (folder / "truth.json").is_file()
@@ -174,6 +174,6 @@ def test_scan_of_another_renderer(shared_data: Path) -> None:
     folder = shared_data / "scans_other_renderer" / "tilt_a"
     scan = read_scan(folder)
     assert (scan.lines, scan.rig.width_px, scan.travel.line_pitch_mm) == (704, 893, 0.56)
-    for name, image in (("left", scan.left), ("right", scan.right)):
+    for name, image in (("left", scan.left), ("right", scan.images.right)):
         expected = tifffile.imread(folder / f"{name}.tif")
         assert torch.equal(image.read(100, 333), torch.from_numpy(expected[100:333]))

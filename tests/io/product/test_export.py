@@ -70,6 +70,6 @@ def test_tiff_in_tifffile(tmp_path: Path) -> None:
 
 def test_a_product_without_its_depth_makes_no_points(tmp_path: Path) -> None:
     product = write(tmp_path / "a.zarr", metadata={})
-    with pytest.raises(FileFormatError, match=r"a\.zarr: lsvision\.zero_disparity_mm: expected a number"):
+    with pytest.raises(FileFormatError, match=r"a\.zarr: lsvision\.height_datum_mm: expected a number"):
         export_product(product, "ply", tmp_path / "a")
     assert [path.name for path in tmp_path.iterdir()] == ["a.zarr"]

@@ -12,13 +12,16 @@ from lsvision.image.board.detect import DetectedCorners
 from lsvision.simulation import EncoderConfig
 from lsvision.stages.corners.config import CornersConfig
 from lsvision.stages.corners.find import _triangulated, find_corners
-from lsvision.types import Scan, TensorImage, Travel
+from lsvision.types import DepthView, Scan, StereoPair, TensorImage, Travel
 from tests.stages.other_renderer import tilt_corners, tilt_scans, true_points
 from tests.stages.rendered import BOARD, PITCH, SMALL_RIG, depth_scan, simulation, stereo_scan, true_measurement
 
 
 def rms(error: torch.Tensor) -> torch.Tensor:
     return error.square().mean(0).sqrt()
+
+
+BLANK = TensorImage(torch.zeros(2, 2, 1))
 
 
 def test_corners_of_another_renderer(shared_data: Path):
@@ -41,8 +44,9 @@ def test_one_corner_by_hand():
     covariance = 0.0004 * torch.eye(2).double()[None]
     left = DetectedCorners(position, covariance, torch.ones(1, dtype=torch.bool))
     right = dataclasses.replace(left, position=position + torch.tensor([[0.0, 0.5]]).double())
-    scan = Scan(Path("hand"), SMALL_RIG, Travel(PITCH), TensorImage(torch.zeros(2, 2, 1)), None, None)
-    points, covariance, valid = _triangulated(scan, left, right, CornersConfig())
+    scan = Scan(Path("hand"), SMALL_RIG, Travel(PITCH), StereoPair(BLANK, BLANK))
+    measured = _triangulated(scan, left, right, CornersConfig())
+    points, covariance, valid = measured.points, measured.covariance, measured.valid
     z0 = SMALL_RIG.zero_disparity_mm
     torch.testing.assert_close(
         points[0], torch.tensor([0.0, 100.25 * PITCH, z0], dtype=torch.float64), rtol=0, atol=1e-9
@@ -52,7 +56,7 @@ def test_one_corner_by_hand():
     torch.testing.assert_close(covariance[0].diagonal().sqrt(), expected.double(), rtol=1e-6, atol=0)
     apart = dataclasses.replace(left, position=position + torch.tensor([[0.0, 1.5]]).double())
     assert valid.all()
-    assert not _triangulated(scan, left, apart, CornersConfig())[2].any()
+    assert not _triangulated(scan, left, apart, CornersConfig()).valid.any()
 
 
 @pytest.mark.parametrize("transport", ["forward", "reverse"])
@@ -65,12 +69,11 @@ def test_covariance_agrees_with_monte_carlo(transport):
         position = torch.tensor([u, 200.0]).double() + torch.randn(draws, 2).double() @ factor.mT
         return DetectedCorners(position, (factor @ factor.mT).expand(draws, 2, 2), torch.ones(draws, dtype=torch.bool))
 
-    scan = Scan(Path("drawn"), SMALL_RIG, Travel(PITCH, None, transport), TensorImage(torch.zeros(2, 2, 1)), None, None)
-    points, covariance, valid = _triangulated(
-        scan, detected(300.0, factor_left), detected(293.0, factor_right), CornersConfig()
-    )
-    assert valid.all()
-    sampled, predicted = torch.cov(points.T), covariance.mean(0)
+    scan = Scan(Path("drawn"), SMALL_RIG, Travel(PITCH, None, transport), StereoPair(BLANK, BLANK))
+    left, right = detected(300.0, factor_left), detected(293.0, factor_right)
+    measured = _triangulated(scan, left, right, CornersConfig())
+    assert measured.valid.all()
+    sampled, predicted = torch.cov(measured.points.T), measured.covariance.mean(0)
     sigma = predicted.diagonal().sqrt()
     torch.testing.assert_close(sampled / sigma / sigma[:, None], predicted / sigma / sigma[:, None], rtol=0, atol=0.05)
 
@@ -104,18 +107,18 @@ def test_no_board_names_the_scan():
     scan = stereo_scan(source)
     blank = TensorImage(torch.full_like(scan.left.tensor, 90))
     with pytest.raises(BoardNotFoundError, match="rendered: no board of 12 x 9 squares in the left image"):
-        find_corners(dataclasses.replace(scan, left=blank), BOARD)
+        find_corners(dataclasses.replace(scan, images=StereoPair(blank, scan.images.right)), BOARD)
     with pytest.raises(BoardNotFoundError, match="in the right image"):
-        find_corners(dataclasses.replace(scan, right=blank), BOARD)
+        find_corners(dataclasses.replace(scan, images=StereoPair(scan.left, blank)), BOARD)
     with pytest.raises(BoardNotFoundError, match=r"88 of 88 corners .* 89 are needed"):
         find_corners(scan, BOARD, CornersConfig(min_corners=89))
 
 
 def test_corners_without_depth_are_not_valid():
     scan = depth_scan(simulation())
-    depth = scan.depth.tensor.clone()
+    depth = scan.images.depth.tensor.clone()
     depth[: len(depth) // 2] = torch.nan
-    corners = find_corners(dataclasses.replace(scan, depth=TensorImage(depth)), BOARD)
+    corners = find_corners(dataclasses.replace(scan, images=DepthView(scan.left, TensorImage(depth))), BOARD)
     assert 20 <= int(corners.valid.sum()) < 88
     assert corners.points[~corners.valid].isnan().all()
     assert corners.covariance[~corners.valid].isnan().all()

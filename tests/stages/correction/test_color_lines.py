@@ -11,6 +11,7 @@ from torch import Tensor
 from lsvision.simulation import EncoderConfig, MotionConfig, SceneConfig, SensorConfig, simulate
 from lsvision.stages.correction.config import CorrectionConfig
 from lsvision.stages.correction.correct import correct_scan
+from lsvision.stages.disparity.depth import depth_of
 from lsvision.types import Motion
 from tests.stages.rendered import BOARD, PITCH, SMALL_RIG, depth_scan
 
@@ -31,7 +32,7 @@ def product(spacing: float, *, registered: bool, transport: str, encoder: Encode
     if not corrected:
         scan = dataclasses.replace(scan, rig=SMALL_RIG)
     motion = Motion(source.trajectory.n, torch.zeros(3, 3).double())
-    (strip,) = correct_scan(scan, scan.depth, motion, CONFIG)
+    (strip,) = correct_scan(scan, depth_of(scan), motion, CONFIG)
     assert bool(strip.valid[PATCH].all())
     return strip.color[PATCH].to(torch.float32)
 

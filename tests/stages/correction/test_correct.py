@@ -11,9 +11,10 @@ from lsvision.errors import ConfigError
 from lsvision.geometry import line_at, product_axes, to_product, travel_at
 from lsvision.image.tiling import PIXEL_PARTS
 from lsvision.stages.correction.config import CorrectionConfig
-from lsvision.stages.correction.correct import correct_rows, correct_scan
+from lsvision.stages.correction.correct import Correction, correct_scan
 from lsvision.stages.correction.grid import plan_product
-from lsvision.types import Motion, Rig, Scan, TensorImage, Travel
+from lsvision.stages.disparity.depth import depth_of
+from lsvision.types import DepthView, Motion, Rig, Scan, TensorImage, Travel
 from tests.stages.rendered import PITCH, SMALL_RIG
 
 LINES = 150
@@ -37,7 +38,7 @@ def motion_of(n: tuple[float, float, float]) -> Motion:
 
 def scan_of(depth: Tensor, travel: Travel, rig: Rig = RIG) -> Scan:
     color = torch.randint(1, 256, (*depth.shape, 3)).to(torch.uint8)
-    return Scan(Path("plane"), rig, travel, TensorImage(color), None, TensorImage(depth.float()[..., None]))
+    return Scan(Path("plane"), rig, travel, DepthView(TensorImage(color), TensorImage(depth.float()[..., None])))
 
 
 def flat(depth: float = DEPTH) -> Tensor:
@@ -66,7 +67,7 @@ def test_source_and_height_of_a_plane_agree_with_the_model(case):
     margin = torch.stack(beyond).amin(0)
     inside, on_rim = margin > 1e-6, margin.abs() <= 1e-6
 
-    (strip,) = correct_scan(scan, scan.depth, motion, dataclasses.replace(CONFIG, strip_rows=grid.rows))
+    (strip,) = correct_scan(scan, depth_of(scan), motion, dataclasses.replace(CONFIG, strip_rows=grid.rows))
     assert torch.equal(strip.valid[~on_rim], inside[~on_rim])
     assert torch.equal(strip.height.isfinite(), strip.valid)
     for part, true in enumerate((true_line, true_column)):
@@ -74,7 +75,8 @@ def test_source_and_height_of_a_plane_agree_with_the_model(case):
         assert (off <= 0.5 / PIXEL_PARTS + 1e-6 + 1e-6 * true[inside]).all()  # the map tells what was sampled
     _, _, e_z = product_axes(motion.n)
     x = (true_column - RIG.principal_left_px) / RIG.focal_length_px * DEPTH
-    height = RIG.zero_disparity_mm - (x * e_z[0] + DEPTH * e_z[2])
+    middle = torch.tensor([RIG.baseline_mm / 2, 0.0, RIG.zero_disparity_mm], dtype=torch.float64)
+    height = e_z @ middle - (x * e_z[0] + DEPTH * e_z[2])
     assert (strip.height.double() - height)[inside].abs().max() < 1e-4
 
 
@@ -88,7 +90,7 @@ def test_nominal_product_of_the_zero_plane_is_the_scan():
     grid = dataclasses.replace(
         grid, origin_x_mm=-RIG.principal_left_px * pitch, columns=RIG.width_px - 1, rows=LINES - 1
     )
-    strip = correct_rows(scan, scan.depth, motion, CONFIG, grid, (1, LINES - 1))
+    strip = Correction(scan, depth_of(scan), motion, CONFIG, grid).strip((1, LINES - 1))
     interior = (slice(0, -1), slice(1, -1))
     assert (strip.color.int() - scan.left.tensor[1:-1, :-1].int())[interior].abs().max() <= 1
     assert strip.height[interior].abs().max() < 1e-4
@@ -105,7 +107,7 @@ def test_strips_change_no_bit(case):
     grid = plan_product(scan, motion, CONFIG)
 
     def product(rows: int) -> list[Tensor]:
-        strips = list(correct_scan(scan, scan.depth, motion, dataclasses.replace(CONFIG, strip_rows=rows)))
+        strips = list(correct_scan(scan, depth_of(scan), motion, dataclasses.replace(CONFIG, strip_rows=rows)))
         assert [strip.row for strip in strips] == list(range(0, grid.rows, rows))
         return [torch.cat([getattr(s, part) for s in strips]) for part in ("color", "height", "valid", "source")]
 
@@ -128,7 +130,7 @@ def test_at_a_step_the_nearer_surface_wins():
     motion = motion_of((0.0, 1.0, 0.0))
     scan = scan_of(stepped(near_on_the_right=True), Travel(PITCH))
     grid = plan_product(scan, motion, CONFIG)
-    strip = correct_rows(scan, scan.depth, motion, CONFIG, grid, (40, 80))
+    strip = Correction(scan, depth_of(scan), motion, CONFIG, grid).strip((40, 80))
     q_x = grid.origin_x_mm + grid.pitch_mm * torch.arange(grid.columns).double()
     edge_near, edge_far = (
         (k - RIG.principal_left_px) / RIG.focal_length_px * z for k, z in ((180, 780.0), (179, 800.0))
@@ -147,7 +149,7 @@ def test_behind_a_step_nothing_is_interpolated():
     motion = motion_of((0.0, 1.0, 0.0))
     scan = scan_of(stepped(near_on_the_right=False), Travel(PITCH))
     grid = plan_product(scan, motion, CONFIG)
-    strip = correct_rows(scan, scan.depth, motion, CONFIG, grid, (40, 80))
+    strip = Correction(scan, depth_of(scan), motion, CONFIG, grid).strip((40, 80))
     q_x = grid.origin_x_mm + grid.pitch_mm * torch.arange(grid.columns).double()
     edge_near, edge_far = (
         (k - RIG.principal_left_px) / RIG.focal_length_px * z for k, z in ((119, 780.0), (120, 800.0))
@@ -164,7 +166,7 @@ def test_a_step_along_the_motion_is_not_interpolated():
     depth = flat(800.0)
     depth[75:] = 780.0
     scan = scan_of(depth, Travel(PITCH))
-    (strip,) = correct_scan(scan, scan.depth, motion, dataclasses.replace(CONFIG, strip_rows=1000))
+    (strip,) = correct_scan(scan, depth_of(scan), motion, dataclasses.replace(CONFIG, strip_rows=1000))
     line = strip.source[..., 0]
     between = (line > 74.001) & (line < 74.999)
     assert not between.any()
@@ -178,9 +180,9 @@ def test_small_holes_are_bridged_for_colour_alone():
     depth[50:60, 130:180] = torch.nan  # wider than bridge_px
     scan = scan_of(depth, Travel(PITCH))
     full = scan_of(flat(), Travel(PITCH))
-    (strip,) = correct_scan(scan, scan.depth, motion, config)
+    (strip,) = correct_scan(scan, depth_of(scan), motion, config)
     line, column = strip.source.unbind(-1)
-    (unharmed,) = correct_scan(full, full.depth, motion, config)
+    (unharmed,) = correct_scan(full, depth_of(full), motion, config)
     across, along = unharmed.source[..., 1], unharmed.source[..., 0]
     in_lines = (along > 49) & (along < 60)
     small = in_lines & (across > 89) & (across < 100)
@@ -226,7 +228,7 @@ class Unreadable:
 
 
 def test_planning_a_long_scan_reads_nothing():
-    scan = Scan(Path("long"), RIG, Travel(PITCH), Unreadable(), None, Unreadable())
+    scan = Scan(Path("long"), RIG, Travel(PITCH), DepthView(Unreadable(), Unreadable()))
     motion = motion_of((0.02, 1.0, 0.01))
     grid = plan_product(scan, motion, CONFIG)
     assert abs(grid.rows - 1e7 * motion.stretch) < 100
@@ -242,7 +244,7 @@ def test_rows_beyond_the_scan_are_empty():
     motion = motion_of((0.0, 1.0, 0.0))
     scan = scan_of(flat(), Travel(PITCH))
     grid = dataclasses.replace(plan_product(scan, motion, CONFIG), rows=10_000)
-    strip = correct_rows(scan, scan.depth, motion, CONFIG, grid, (5000, 5003))
+    strip = Correction(scan, depth_of(scan), motion, CONFIG, grid).strip((5000, 5003))
     assert strip.color.shape == (3, grid.columns, 3)
     assert not strip.valid.any()
     assert strip.height.isnan().all()
@@ -256,7 +258,7 @@ def test_an_overview_of_many_lines_a_cell_is_the_same_in_any_strips(resampler):
     config = dataclasses.replace(CONFIG, pitch_mm=pitch, resampler=resampler)
     made = []
     for rows in (64, 10_000):
-        strips = list(correct_scan(scan, scan.depth, motion, dataclasses.replace(config, strip_rows=rows)))
+        strips = list(correct_scan(scan, depth_of(scan), motion, dataclasses.replace(config, strip_rows=rows)))
         made.append(torch.cat([strip.color for strip in strips]))
     assert len(made[0]) > 500
     assert torch.equal(*made)

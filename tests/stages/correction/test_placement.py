@@ -9,15 +9,14 @@ import torch
 import torch.nn.functional as F  # noqa: N812
 from torch import Tensor
 
-from lsvision.geometry import to_product, travel_at
+from lsvision.geometry import ProductFrame
 from lsvision.simulation import EncoderConfig, MotionConfig, SceneConfig, SensorConfig, scaled_rig, simulate
 from lsvision.stages.correction.config import CorrectionConfig
 from lsvision.stages.correction.correct import correct_scan
 from lsvision.stages.correction.grid import plan_product
-from lsvision.stages.correction.uncertainty import sigma_of
 from lsvision.stages.disparity.config import DisparityConfig
-from lsvision.stages.disparity.depth import MatchedDepth
-from lsvision.types import LineImage, Motion, Scan, TensorImage
+from lsvision.stages.disparity.depth import depth_of
+from lsvision.types import DepthSource, DepthView, Motion, Scan, StereoPair, TensorImage
 from tests.stages.rendered import BOARD, FULL_RIG
 
 # 2.1° about both axes: the motion lies 3° off the nominal.
@@ -48,12 +47,14 @@ def rendered(kind: str, scale: float, stretch: float, lines: int, encoder: bool,
     cameras = ("left", "right") if right else ("left",)
     images = [TensorImage(torch.cat(list(source.strips(camera)))) for camera in cameras]
     depth = torch.cat(list(source.depth_strips()))
-    scan = Scan(Path(kind), source.rig, source.travel, images[0], images[1] if right else None, None)
+    depth_map = TensorImage(depth[..., None])
+    pair = StereoPair(*images) if right else DepthView(images[0], depth_map)
+    scan = Scan(Path(kind), source.rig, source.travel, pair)
     return scan, depth, Motion(source.trajectory.n, torch.zeros(3, 3, dtype=torch.float64))
 
 
 def misplacement(
-    scan: Scan, depth: LineImage, true: Tensor, motion: Motion, margin: int
+    scan: Scan, depth: DepthSource, true: Tensor, motion: Motion, margin: int
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Distance in px of every measured cell from where the truth puts what it shows, the error of its height, mm, and
     the standard deviations that the product tells of (q_x, q_y, q_z), mm.
@@ -61,7 +62,7 @@ def misplacement(
     Cells within ``margin`` samples of an occlusion edge are left out.
     """
     grid = plan_product(scan, motion, CONFIG)
-    strips = list(correct_scan(scan, depth, motion, CONFIG, grid, sigma_of(depth)))
+    strips = list(correct_scan(scan, depth, motion, CONFIG, grid))
     valid = torch.cat([strip.valid for strip in strips])
     line, column = torch.cat([strip.source for strip in strips])[valid].double().unbind(-1)
     height = torch.cat([strip.height for strip in strips])[valid].double()
@@ -72,8 +73,8 @@ def misplacement(
         torch.lerp(true[row, before].double(), true[row, before + 1].double(), right) for row in (above, above + 1)
     )
     z = torch.lerp(upper, lower, down)
-    x = (column - scan.rig.principal_left_px) / scan.rig.focal_length_px * z
-    q = to_product(torch.stack([x, travel_at(scan.travel, line), z], dim=-1), motion.n)
+    frame = ProductFrame(scan.rig, scan.travel, motion.n)
+    q = frame.position(column, line, z)
     row, cell = valid.nonzero().unbind(1)
     across = (q[:, 0] - grid.origin_x_mm) / grid.pitch_mm - cell
     along = (q[:, 1] - grid.origin_y_mm) / grid.pitch_mm - row
@@ -82,7 +83,7 @@ def misplacement(
     )
     clear = F.max_pool2d(edges[None].float(), 2 * margin + 1, 1, margin)[0][above, before] == 0
     assert clear.float().mean() > 0.5
-    error = height - (scan.rig.zero_disparity_mm - q[:, 2])
+    error = height - (frame.height_datum_mm - q[:, 2])
     return torch.hypot(across, along)[clear], error[clear], sigma[clear]
 
 
@@ -91,7 +92,7 @@ def misplacement(
 @pytest.mark.parametrize("kind", ["sheet", "rail"])
 def test_with_the_true_depth_nothing_is_out_of_place(kind: str, stretch: float, encoder: bool) -> None:
     scan, depth, motion = rendered(kind, 16.0, stretch, 200, encoder, right=False)
-    shift, error, _ = misplacement(scan, TensorImage(depth[..., None]), depth, motion, 1)
+    shift, error, _ = misplacement(scan, depth_of(scan), depth, motion, 1)
     assert shift.max() < 0.002
     assert error.abs().max() < 1e-3
 
@@ -101,7 +102,7 @@ def test_with_the_true_depth_nothing_is_out_of_place(kind: str, stretch: float, 
 def test_at_full_size_the_matched_depth_puts_pixels_within_a_tenth(kind: str, stretch: float, encoder: bool) -> None:
     scan, true, motion = rendered(kind, 1.0, stretch, 320, encoder, right=True)
     fine = DisparityConfig(matcher="coarse_to_fine", refine_iterations=1, largest_sigma_px=0.2, halo_lines=48)
-    shift, error, sigma = misplacement(scan, MatchedDepth(scan, fine), true, motion, 24)
+    shift, error, sigma = misplacement(scan, depth_of(scan, fine), true, motion, 24)
     assert shift.square().mean().sqrt() <= 0.1
     # Noise of the deviations that are told would carry more cells than these beyond 0.3 px.
     told = torch.hypot(sigma[:, 0], sigma[:, 1]) / scan.travel.line_pitch_mm

@@ -6,11 +6,12 @@ from pathlib import Path
 import pytest
 import torch
 
-from lsvision.geometry import displace, product_axes
+from lsvision.geometry import ProductFrame, depth_sigma, displace, product_axes
 from lsvision.stages.correction.config import CorrectionConfig
 from lsvision.stages.correction.correct import correct_scan
 from lsvision.stages.correction.uncertainty import drift_per_metre, position_sigma
-from lsvision.types import Motion, Scan, TensorImage, Travel
+from lsvision.stages.disparity.depth import depth_of
+from lsvision.types import DepthView, Motion, Scan, StoredDepth, TensorImage, Travel
 from tests.stages.rendered import PITCH, SMALL_RIG
 
 N = torch.tensor([-0.03, 1.02, 0.05], dtype=torch.float64)
@@ -21,7 +22,7 @@ MOTION = Motion(N, ROOT @ ROOT.mT)
 def scan_of(lines: int, travel: Travel) -> Scan:
     depth = torch.full((lines, SMALL_RIG.width_px, 1), 790.0)
     color = torch.zeros(lines, SMALL_RIG.width_px, 3, dtype=torch.uint8)
-    return Scan(Path("plane"), SMALL_RIG, travel, TensorImage(color), None, TensorImage(depth))
+    return Scan(Path("plane"), SMALL_RIG, travel, DepthView(TensorImage(color), TensorImage(depth)))
 
 
 @pytest.mark.parametrize("transport", ["forward", "reverse"])
@@ -35,9 +36,9 @@ def test_equals_monte_carlo(transport) -> None:
     drawn_z = z + 0.3 * noise[:, 0]
     measured = torch.stack([slope * drawn_z, torch.full_like(drawn_z, y), drawn_z], dim=-1)
     points = displace(measured, N + noise[:, 1:] @ ROOT.mT) @ axes.mT
-    q_z = axes[2] @ torch.tensor([slope * z, 0.0, z], dtype=torch.float64)
-    cell = [torch.full((1, 1), float(value), dtype=torch.float64) for value in (line, column, q_z)]
-    sigma = position_sigma(scan, MOTION, *cell, 9.9, torch.full((1, 1), 0.3, dtype=torch.float64))
+    frame = ProductFrame(scan.rig, scan.travel, N)
+    cell = [torch.full((1, 1), float(value), dtype=torch.float64) for value in (column, line, 0.3)]
+    sigma = position_sigma(frame, MOTION.covariance, *cell)
     torch.testing.assert_close(sigma[0, 0], points.std(0), rtol=0.01, atol=0)
 
 
@@ -45,9 +46,10 @@ def test_by_hand() -> None:
     # Straight below the left camera, the depth of a still object: one axis, no travel.
     motion = Motion(torch.tensor([0.0, 1.0, 0.0]).double(), torch.diag(torch.tensor([1e-6, 4e-6, 9e-6]).double()))
     z, c = 800.0, SMALL_RIG.principal_left_px
-    cell = [torch.full((1, 1), value, dtype=torch.float64) for value in (0.0, c, z)]
-    sigma = position_sigma(scan_of(3, Travel(PITCH)), motion, *cell, 0.1)
     matched = 0.1 * z**2 / (SMALL_RIG.focal_length_px * SMALL_RIG.baseline_mm)
+    known = depth_sigma(SMALL_RIG, torch.full((1, 1), z, dtype=torch.float64), 0.1)
+    frame = ProductFrame(SMALL_RIG, Travel(PITCH), motion.n)
+    sigma = position_sigma(frame, motion.covariance, torch.full((1, 1), c).double(), torch.zeros(1, 1).double(), known)
     torch.testing.assert_close(sigma[0, 0], torch.tensor([0.0, 0.0, matched], dtype=torch.float64))
     assert drift_per_metre(motion) == pytest.approx((1.0, 2.0, 3.0))
     longer = dataclasses.replace(motion, n=2 * motion.n)
@@ -58,16 +60,20 @@ def test_by_hand() -> None:
 def test_products_carry_it_on_request(known: bool) -> None:
     scan = scan_of(120, Travel(PITCH))
     config = CorrectionConfig(height_range_mm=(-30.0, 30.0), strip_rows=1000, uncertainty=True)
-    depth_sigma = torch.full(scan.depth.shape, 0.05)
-    depth_sigma[:, 300:] = 0.2
-    (strip,) = correct_scan(scan, scan.depth, MOTION, config, None, TensorImage(depth_sigma) if known else None)
+    sigma_map = torch.full(scan.images.depth.shape, 0.05)
+    sigma_map[:, 300:] = 0.2
+    depth = StoredDepth(scan.images.depth, TensorImage(sigma_map) if known else None)
+    (strip,) = correct_scan(scan, depth, MOTION, config)
     assert torch.equal(strip.sigma.isfinite().all(-1), strip.valid)
     line, column = (strip.source[..., part].double() for part in range(2))
-    q_z = SMALL_RIG.zero_disparity_mm - strip.height.double()
-    at_cell = torch.where(column < 299, 0.05, 0.2).double() if known else None
-    expected = position_sigma(scan, MOTION, line, column, q_z, config.disparity_sigma_px, at_cell)
+    frame = ProductFrame(scan.rig, scan.travel, N)
+    z = frame.depth(column, strip.height.double() - frame.height_over_relief_mm)
+    at_cell = torch.where(column < 299, 0.05, 0.2).double()
+    if not known:
+        at_cell = depth_sigma(scan.rig, z, config.disparity_sigma_px)
+    expected = position_sigma(frame, MOTION.covariance, column, line, at_cell)
     clear = strip.valid & ((column - 299.5).abs() > 1)
     torch.testing.assert_close(strip.sigma[clear], expected[clear].float(), rtol=1e-4, atol=1e-6)
     plain = dataclasses.replace(config, uncertainty=False)
-    (without,) = correct_scan(scan, scan.depth, MOTION, plain)
+    (without,) = correct_scan(scan, depth_of(scan), MOTION, plain)
     assert without.sigma is None

@@ -7,14 +7,14 @@ from pathlib import Path
 import pytest
 import torch
 
-from lsvision.geometry import depth_at, triangulate, triangulation_jacobian
+from lsvision.geometry import depth_at, depth_sigma, triangulate, triangulation_jacobian
 from lsvision.image.brightness import gray
 from lsvision.image.stereo.sgbm import match_sgbm
 from lsvision.simulation import SceneConfig
 from lsvision.stages.disparity.config import DisparityConfig
-from lsvision.stages.disparity.depth import MatchedDepth, depth_of, depth_sigma
+from lsvision.stages.disparity.depth import MatchedDepth, depth_of
 from lsvision.stages.disparity.match import StripMatch, disparity_range, measure_strip
-from lsvision.types import Scan, TensorImage, Travel
+from lsvision.types import DepthView, Scan, StereoPair, StoredDepth, TensorImage, Travel
 from tests.stages.rendered import FULL_RIG, PITCH, SMALL_RIG, simulation, stereo_scan
 
 CONFIG = DisparityConfig(block_lines=64, halo_lines=16)
@@ -50,28 +50,28 @@ def test_depth_equals_triangulation_pixel_by_pixel():
 @pytest.mark.parametrize("config", [CONFIG, FINE])
 @pytest.mark.parametrize("strip_lines", [64, 100, 257, 10_000])
 def test_strips_of_any_height_and_the_whole_are_equal(sheet, config, strip_lines):
-    left, right = sheet[1].left.read(0, sheet[1].lines), sheet[1].right.read(0, sheet[1].lines)
+    left, right = sheet[1].left.read(0, sheet[1].lines), sheet[1].images.right.read(0, sheet[1].lines)
     untiled = depth_at(SMALL_RIG, measure_strip(left, right, SMALL_RIG, config).disparity)
-    tiled = MatchedDepth(sheet[1], dataclasses.replace(config, strip_lines=strip_lines))
-    parts = [tiled.read(start, min(start + strip_lines, len(left))) for start in range(0, len(left), strip_lines)]
-    assert torch.cat(parts)[..., 0].numpy().tobytes() == untiled.numpy().tobytes()
+    tiled = MatchedDepth(sheet[1].images, sheet[1].rig, dataclasses.replace(config, strip_lines=strip_lines))
+    parts = [tiled.read(start, min(start + strip_lines, len(left))).z for start in range(0, len(left), strip_lines)]
+    assert torch.cat(parts).numpy().tobytes() == untiled.numpy().tobytes()
 
 
 @pytest.mark.parametrize("config", [CONFIG, FINE])
 def test_values_do_not_depend_on_the_range_read(sheet, config):
     scan = sheet[1]
-    whole = MatchedDepth(scan, config).read(0, scan.lines)
-    assert whole.shape == (scan.lines, SMALL_RIG.width_px, 1)
-    lazy = MatchedDepth(scan, config, kept_blocks=2)
+    whole = MatchedDepth(scan.images, scan.rig, config).read(0, scan.lines).z
+    assert whole.shape == (scan.lines, SMALL_RIG.width_px)
+    lazy = MatchedDepth(scan.images, scan.rig, config, kept_blocks=2)
     for start, stop in ((0, 5), (60, 70), (100, 200), (63, 64), (scan.lines - 3, scan.lines), (10, 12)):
-        torch.testing.assert_close(lazy.read(start, stop), whole[start:stop], rtol=0, atol=0, equal_nan=True)
+        torch.testing.assert_close(lazy.read(start, stop).z, whole[start:stop], rtol=0, atol=0, equal_nan=True)
         assert len(lazy._blocks) <= 2
 
 
 @pytest.mark.parametrize("config", [CONFIG, dataclasses.replace(FINE, refine_iterations=2)])
 def test_height_of_a_rendered_plane(sheet, config):
     source, scan = sheet
-    depth = MatchedDepth(scan, config).read(0, scan.lines)[..., 0]
+    depth = MatchedDepth(scan.images, scan.rig, config).read(0, scan.lines).z
     truth = torch.cat(list(source.depth_strips()))
     inside = (slice(40, -40), slice(80, -80))
     error_px = to_disparity(depth, truth)[inside]
@@ -83,8 +83,9 @@ def test_height_of_a_rendered_plane(sheet, config):
 
 def test_deviation_is_that_of_the_errors(sheet):
     source, scan = sheet
-    matched = MatchedDepth(scan, CONFIG)
-    depth, sigma = (read(0, scan.lines)[..., 0] for read in (matched.read, matched.read_sigma))
+    matched = MatchedDepth(scan.images, scan.rig, CONFIG)
+    read = matched.read(0, scan.lines)
+    depth, sigma = read.z, read.sigma
     assert torch.equal(depth.isnan(), sigma.isnan())
     inside = (slice(40, -40), slice(80, -80))
     truth = torch.cat(list(source.depth_strips()))
@@ -98,13 +99,13 @@ def test_deviation_of_depth_follows_the_triangulation():
     depth = triangulate(SMALL_RIG, column, disparity)[1]
     sigma = torch.tensor([0.02, 0.05, 0.3]).double()
     expected = triangulation_jacobian(SMALL_RIG, column, disparity)[:, 1, 1].abs() * sigma
-    torch.testing.assert_close(depth_sigma(depth, sigma, SMALL_RIG), expected)
+    torch.testing.assert_close(depth_sigma(SMALL_RIG, depth, sigma), expected)
 
 
 @pytest.mark.parametrize("config", [CONFIG, FINE])
 def test_images_that_match_nothing(sheet, config):
     scan = sheet[1]
-    left, right = scan.left.read(64, 192), scan.right.read(64, 192)
+    left, right = scan.left.read(64, 192), scan.images.right.read(64, 192)
     black, white = torch.zeros_like(left), torch.full_like(left, 255)
     for pair in ((left, black), (black, right), (left, white)):
         match = measure_strip(*pair, SMALL_RIG, config)
@@ -117,7 +118,7 @@ def test_images_that_match_nothing(sheet, config):
 @pytest.mark.parametrize("config", [CONFIG, FINE])
 def test_mono_and_sixteen_bit_scans_match_alike(sheet, config):
     scan = sheet[1]
-    left, right = scan.left.read(64, 192), scan.right.read(64, 192)
+    left, right = scan.left.read(64, 192), scan.images.right.read(64, 192)
     colour = measure_strip(left, right, SMALL_RIG, config).disparity
     mono = (gray(image).round().to(torch.uint8)[..., None] for image in (left, right))
     deep = (image.to(torch.int32).mul(257).to(torch.uint16) for image in (left, right))
@@ -145,7 +146,7 @@ def to_disparity(depth, truth):
 
 def test_no_refinement_is_the_matcher_alone(sheet):
     scan = sheet[1]
-    left, right = scan.left.read(0, 64), scan.right.read(0, 64)
+    left, right = scan.left.read(0, 64), scan.images.right.read(0, 64)
     config = dataclasses.replace(CONFIG, refine_iterations=0, block_lines=64, halo_lines=0)
     low, high = disparity_range(SMALL_RIG, config)
     expected = match_sgbm(
@@ -160,13 +161,13 @@ def test_no_refinement_is_the_matcher_alone(sheet):
         uniqueness_percent=5,
         speckle_px=100,
     )
-    depth = MatchedDepth(scan, config).read(0, 64)[..., 0]
+    depth = MatchedDepth(scan.images, scan.rig, config).read(0, 64).z
     torch.testing.assert_close(depth, depth_at(SMALL_RIG, expected), equal_nan=True)
 
 
-def test_own_depth_comes_first():
+def test_a_scan_with_a_depth_map_is_not_matched():
     image = TensorImage(torch.zeros(4, SMALL_RIG.width_px, 1, dtype=torch.uint8))
     depth = TensorImage(torch.full((4, SMALL_RIG.width_px, 1), 800.0))
-    scan = Scan(Path("both"), SMALL_RIG, Travel(PITCH), image, image, depth)
-    assert depth_of(scan, CONFIG) is depth
-    assert isinstance(depth_of(dataclasses.replace(scan, depth=None), CONFIG), MatchedDepth)
+    scan = Scan(Path("mapped"), SMALL_RIG, Travel(PITCH), DepthView(image, depth))
+    assert depth_of(scan, CONFIG) == StoredDepth(depth)
+    assert isinstance(depth_of(dataclasses.replace(scan, images=StereoPair(image, image)), CONFIG), MatchedDepth)
