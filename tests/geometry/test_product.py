@@ -102,13 +102,15 @@ def test_round_trip(travel: str) -> None:
 def test_derivatives() -> None:
     """Along its ray a sample moves by ``ray`` per mm of depth, with the line by the advance along e_y."""
     frame = frame_of()
-    column, line, z = (torch.tensor(value, dtype=torch.float64) for value in (3000.0, 50.0, 790.0))
-    by_column = jacobian(lambda at: frame.position(at, line, z), column)
-    by_line = jacobian(lambda at: frame.position(column, at, z), line)
-    by_depth = jacobian(lambda at: frame.position(column, line, at), z)
-    torch.testing.assert_close(by_depth, frame.ray(column), rtol=0, atol=1e-12)
-    torch.testing.assert_close(by_line, torch.tensor([0.0, frame.advance_mm, 0.0]).double(), rtol=0, atol=1e-12)
-    inverse = jacobian(frame.source, frame.position(column, line, z))
+    column, line, z = (torch.tensor([value], dtype=torch.float64) for value in (3000.0, 50.0, 790.0))
+    by_column = jacobian(lambda at: frame.position(at, line, z)[0], column)[:, 0]
+    by_line = jacobian(lambda at: frame.position(column, at, z)[0], line)[:, 0]
+    by_depth = jacobian(lambda at: frame.position(column, line, at)[0], z)[:, 0]
+    torch.testing.assert_close(by_depth, frame.ray(column)[0], rtol=0, atol=1e-12)
+    # torch's forward mode rounds Python's scalars, here the line pitch, to single precision.
+    along = torch.tensor([0.0, frame.advance_mm, 0.0], dtype=torch.float64)
+    torch.testing.assert_close(by_line, along, rtol=1e-7, atol=1e-12)
+    inverse = jacobian(frame.source, frame.position(column, line, z)[0])
     forward = torch.stack([by_column, by_line, by_depth], dim=-1)
     torch.testing.assert_close(inverse @ forward, torch.eye(3).double(), rtol=0, atol=1e-6)
 
