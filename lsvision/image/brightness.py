@@ -11,7 +11,11 @@ _SAMPLED_LINES = 16
 
 
 def gray(lines: Shaped[Tensor, "*batch lines width channels"]) -> Float[Tensor, "*batch lines width"]:
-    """Brightness, luma of ITU-R BT.601, of ``(*batch, lines, width, 1 or 3)`` values of any type, float32, unscaled."""
+    """Brightness (luma of ITU-R BT.601) of mono or RGB values of any type; float32 on the same scale.
+
+    Args:
+        lines: ``(*batch, lines, width, 1 or 3)``.
+    """
     values = lines.to(torch.float32)
     if values.shape[-1] == 1:
         return values[..., 0]
@@ -20,7 +24,11 @@ def gray(lines: Shaped[Tensor, "*batch lines width channels"]) -> Float[Tensor, 
 
 
 def gray_bytes(lines: Shaped[Tensor, "lines width channels"], white: float = 255.0) -> UInt8[Tensor, "lines width"]:
-    """Brightness of ``(lines, width, 1 or 3)`` values where ``white`` becomes 255, rounded; brighter ones are white."""
+    """Brightness of mono or RGB values as bytes: ``white`` becomes 255, as does everything brighter.
+
+    Args:
+        lines: ``(lines, width, 1 or 3)``.
+    """
     if lines.dtype == torch.uint8 and white == 255.0:
         if lines.shape[-1] == 1:
             return lines[..., 0].contiguous()
@@ -29,9 +37,9 @@ def gray_bytes(lines: Shaped[Tensor, "lines width channels"], white: float = 255
 
 
 def white_level(*images: LineImage) -> float:
-    """Largest value that the pixels of some images can have: 255, or that of as many bits as their values take.
+    """Largest value that the pixels of some images can have: 255, or the largest number of as many bits as they use.
 
-    Sensors of 10 to 14 bits write 16; a few lines all over the images tell how many are used.
+    Sensors of 10 to 14 bits deliver 16-bit images; sixteen lines spread over each image show how many bits are used.
     """
     if all(image.dtype == torch.uint8 for image in images):
         return 255.0

@@ -7,6 +7,7 @@ import sys
 import threading
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor, wait
+from dataclasses import dataclass
 from typing import TypeVar
 
 import torch
@@ -14,10 +15,10 @@ import torch
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
-TILE = (512, 480)  # rows and columns; tall, for what a tile sees lies in more lines than it has rows
+TILE = (512, 480)  # rows and columns; tall, because a tile sees more scan lines than it has rows
 
-# Positions are rounded to this part of a pixel: float32 holds such a fraction of up to 8192 pixels exactly, so that
-# what is sampled there does not depend on the tile it is counted from.
+# Positions are rounded to this part of a pixel. Float32 holds such fractions exactly up to 8192 pixels, so that a sample
+# does not depend on the tile from which its position is counted.
 PIXEL_PARTS = 2048
 
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD, _M_ARENA_MAX = -1, -3, -8  # of glibc's malloc.h
@@ -33,13 +34,44 @@ def tiles(rows: int, columns: int, size: tuple[int, int] = TILE) -> list[tuple[s
     ]
 
 
-def in_parallel(work: Callable[[Item], Result], items: Iterable[Item]) -> list[Result]:
-    """Results of ``work`` on every item, in order: one thread an item, ``torch.get_num_threads()`` at a time.
+@dataclass(frozen=True)
+class HaloRange:
+    """The range ``start..stop-1`` of an axis, and ``outer_start..outer_stop-1``, which adds a halo at both ends."""
 
-    On pieces this small, threads that share every single operation would spend their time waiting for each other.
+    start: int
+    stop: int
+    outer_start: int
+    outer_stop: int
+
+    @classmethod
+    def at(cls, start: int, size: int, halo: int, length: int) -> "HaloRange":
+        """The range of ``size`` from ``start`` on, cut to an axis of some length."""
+        stop = min(start + size, length)
+        return cls(start, stop, max(start - halo, 0), min(stop + halo, length))
+
+    @property
+    def outer(self) -> slice:
+        """The range with its halo."""
+        return slice(self.outer_start, self.outer_stop)
+
+    @property
+    def inner(self) -> slice:
+        """The range without its halo, counted from the start of the halo."""
+        return slice(self.start - self.outer_start, self.stop - self.outer_start)
+
+
+def halo_ranges(length: int, size: int, halo: int) -> list[HaloRange]:
+    """Ranges of at most ``size`` that cover an axis once, each with its halo."""
+    return [HaloRange.at(start, size, halo, length) for start in range(0, length, size)]
+
+
+def in_parallel(work: Callable[[Item], Result], items: Iterable[Item]) -> list[Result]:
+    """Results of ``work`` on every item, in order, by ``torch.get_num_threads()`` threads with one item each.
+
+    On pieces this small, threads that share each single operation would mostly wait for each other.
 
     Raises:
-        Exception: what the first item that failed raised, when none is worked on any more.
+        Exception: that of the first item that failed, after all threads have stopped working.
     """
     threads = torch.get_num_threads()
     if threads == 1:
@@ -54,32 +86,34 @@ def in_parallel(work: Callable[[Item], Result], items: Iterable[Item]) -> list[R
 
 @functools.cache
 def _pool(threads: int, _process: int) -> ThreadPoolExecutor:
-    """Threads that stay, for starting them takes as long as a dozen tiles; a forked process needs its own."""
+    """Threads that are kept, because starting them takes as long as a dozen tiles; a forked process needs new ones."""
     pool = ThreadPoolExecutor(threads)
     ready = threading.Barrier(threads + 1)
 
     def use_one_thread() -> None:
         torch.set_num_threads(1)
-        torch.get_num_threads()  # from here on the thread keeps its number, whatever others set
+        torch.get_num_threads()  # from here on the thread keeps its setting, whatever others set
         ready.wait()
 
     started = [pool.submit(use_one_thread) for _ in range(threads)]
     ready.wait()
     for thread in started:
         thread.result()
-    torch.set_num_threads(threads)  # what the threads have set also holds for those started later
+    torch.set_num_threads(threads)  # the setting of one thread also holds for those started later
     return pool
 
 
 def keep_freed_memory() -> None:
-    """Let the process keep the memory of finished tiles for the next ones, where the C library is glibc.
+    """Keep the memory of finished tiles for the next ones; does nothing where the C library is not glibc.
 
-    By default it goes back to the system after every tile and comes again page by page, which takes as long as the
+    By default glibc returns it to the system after every tile and gets it back page by page, which takes as long as the
     work itself.
     """
-    if sys.platform == "linux":
-        mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
-        if mallopt is not None:
-            mallopt(_M_MMAP_THRESHOLD, _KEPT_BYTES // 8)
-            mallopt(_M_TRIM_THRESHOLD, _KEPT_BYTES)
-            mallopt(_M_ARENA_MAX, 1)
+    if sys.platform != "linux":
+        return
+    mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
+    if mallopt is None:  # musl has none
+        return
+    mallopt(_M_MMAP_THRESHOLD, _KEPT_BYTES // 8)
+    mallopt(_M_TRIM_THRESHOLD, _KEPT_BYTES)
+    mallopt(_M_ARENA_MAX, 1)

@@ -1,11 +1,13 @@
 """Tiles cover a plane once; work in threads keeps its order and the thread setting."""
 
+import ctypes
+import sys
 import threading
 
 import pytest
 import torch
 
-from lsvision.image.tiling import in_parallel, keep_freed_memory, tiles
+from lsvision.image.tiling import HaloRange, halo_ranges, in_parallel, keep_freed_memory, tiles
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (192, 480), (193, 481), (500, 1300)])
@@ -14,6 +16,14 @@ def test_tiles_cover_every_cell_once(shape: tuple[int, int]) -> None:
     for tile in tiles(*shape):
         covered[tile] += 1
     assert bool((covered == 1).all())
+
+
+def test_ranges_with_halo_by_hand() -> None:
+    expected = [HaloRange(0, 4, 0, 6), HaloRange(4, 8, 2, 10), HaloRange(8, 11, 6, 11)]
+    assert halo_ranges(11, 4, 2) == expected
+    axis = list(range(11))
+    for part in expected:
+        assert axis[part.outer][part.inner] == axis[part.start : part.stop]
 
 
 @pytest.mark.parametrize("threads", [1, 3])
@@ -53,3 +63,19 @@ def test_no_thread_is_at_work_any_more_when_an_error_reaches_the_caller() -> Non
 def test_keeping_memory_is_harmless() -> None:
     keep_freed_memory()
     assert float(torch.ones(2_000_000).sum()) == 2e6
+
+
+@pytest.mark.parametrize("system", ["darwin", "win32"])
+def test_other_systems_have_no_such_setting(system: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    def no_library(name: None) -> None:
+        raise TypeError(f"{name} names no library")
+
+    monkeypatch.setattr(sys, "platform", system)
+    monkeypatch.setattr(ctypes, "CDLL", no_library)
+    keep_freed_memory()
+
+
+def test_other_c_libraries_have_no_such_setting(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "platform", "linux")
+    monkeypatch.setattr(ctypes, "CDLL", lambda name: object())
+    keep_freed_memory()

@@ -1,223 +1,187 @@
 """Dense stereo matching from coarse to fine: the whole range on a small copy, a few disparities on a larger one.
 
-A quarter of the size holds a sixteenth of the pixels and a quarter of the disparities. On smooth ground what it finds,
-refined, is good to half a pixel of its own, within reach of the refinement at half the size. Where that leaves more
-than noise, where the small copy found nothing, and beside an edge, where blocks see two surfaces, the nearest and the
-farthest surface around are both searched for at half the size, and what fits best stays. What is left to find,
-fractions of a pixel, is the work of ``refine_disparity``.
+1. ``_reduced``: both images are shrunk to a half and to a quarter of their size.
+2. ``_search_quarter``: the whole range is searched at a quarter of the size, which holds a sixteenth of the pixels and
+   a quarter of the disparities. On smooth ground the refined result is good to half a pixel of the quarter, within
+   reach of a refinement at half the size.
+3. ``_surfaces_around``: around each pixel of the half the nearest and the farthest surface are known from there.
+4. ``_search_half``: the nearest surface is refined at half the size. Pixels are in doubt where this leaves residuals
+   above noise, where the quarter has no match, and beside an edge, where a block sees two surfaces. There both surfaces
+   are searched around (``BestMatch.search_around``), the disparity that fits best is kept, pixels that contradict the
+   right view are dropped (``agreeing``), and the others are refined.
+5. ``_within_range``: disparities outside of the range or of the right image are dropped.
+
+The remaining fractions of a pixel are the task of ``refine_disparity`` at full size.
 """
 
 import math
-from typing import Any
+from dataclasses import dataclass, replace
 
 import cv2
 import torch
-import torch.nn.functional as F  # noqa: N812
 from jaxtyping import Float
 from torch import Tensor
 
-from lsvision.image.brightness import gray_bytes, white_level
 from lsvision.image.stereo.agreement import agreeing, fill_from_background
-from lsvision.image.stereo.refine import refine_disparity
-from lsvision.image.stereo.sgbm import check_pair, run_sgbm, sgbm_matcher
-from lsvision.types import TensorImage
+from lsvision.image.stereo.best_match import BestMatch, stretches
+from lsvision.image.stereo.blocks import enlarged, repeated
+from lsvision.image.stereo.refine import RefineOptions, refine_disparity
+from lsvision.image.stereo.sgbm import GrayPair, Search, match_sgbm
 
 BLOCK = 2  # pixels along the side of the blocks that get a disparity
 COARSEST = 4  # size of the full image over that of the smallest copy; strips should start at multiples of it
-_AROUND = (-8, 7)  # disparities tried around the coarse one, px of half the size
-# Surfaces that differ by less over a neighbourhood of the small copy, px of it, are within reach of one search.
+_AROUND = (-8, 7)  # disparities searched around a surface, px of half the size
+# Surfaces that differ by less over a neighbourhood of the quarter, px of it, are within reach of one search.
 _TWO_SURFACES_PX = 5.0
-_NEIGHBOURHOOD = 5
-_ROOM_PX = 64
-_SMOOTH_PX = 2.0  # a larger step between neighbours is an edge, over which nothing is interpolated
-_COARSE_SPECKLE = 2  # times the pixels of a speckle: what is removed here is found again at half the size
-# The small copy is in doubt where its refinement leaves residuals over noise that a shift by less, px of half the size,
-# does not explain, in more than so many of 255 parts of a neighbourhood.
+_MEDIAN, _NEIGHBOURHOOD = 5, 5
+_EDGE_PX = 2.0  # a larger step between neighbours is an edge, over which nothing is interpolated
+_COARSE_SPECKLE = 2  # times the pixels of a speckle: a pixel removed from the quarter is searched again in the half
+# The residual of the refinement is above noise where a shift by less, px of half the size, does not explain it; a pixel
+# is in doubt where this holds for more than so many of 255 parts of a neighbourhood.
 _DOUBTFUL_PX = 0.45
 _DOUBT_BLOCK, _DOUBT_LEVEL = 9, 48
-_WINDOW, _COARSE_WINDOW = 9, 7  # of the refinement
-_COST_BLOCK, _COST_LIMIT, _NO_MATCH = 5, 60, 255.0
+_HALF_WINDOW, _QUARTER_WINDOW = 9, 7  # of the refinement
 
 
 def match_coarse_to_fine(
-    left: Tensor,
-    right: Tensor,
-    *,
-    minimum_px: int,
-    maximum_px: int,
-    block_size: int,
-    lambda1: float,
-    lambda2: float,
-    left_right_check_px: int,
-    fine_check_px: int,
-    uniqueness_percent: int,
-    speckle_px: int,
-    noise: float,
-    white: float | None = None,
+    pair: GrayPair, search: Search, *, fine_check_px: int, noise: float
 ) -> Float[Tensor, "rows columns"]:
     """Disparity u_left - u_right of each 2 x 2 pixels of a pair of strips, the last ones perhaps incomplete.
 
-    In pixels of the full size, float32, and good to a fifth of one; NaN for no match. ``refine_disparity`` takes it.
+    In pixels of the full size, float32, and good to a fifth of one; NaN for no match. ``refine_disparity`` improves it.
 
     Args:
-        left, right: as in ``match_sgbm``, as are the range, the block, the penalties and ``white``.
-        left_right_check_px, uniqueness_percent: on the small copy, the former in full pixels.
-        fine_check_px: largest disagreement at half the size, in full pixels.
-        speckle_px: smaller patches are removed, in pixels of half the size.
-        noise: standard deviation of the grey values, of 255.
-
-    Raises:
-        ValueError: shapes differ or the range is empty.
+        search: in pixels of the full size, but ``block_size`` in those of either copy and ``speckle_px`` in those of
+            the half. ``left_right_check_px`` and ``uniqueness_percent`` hold for the quarter.
+        fine_check_px: largest disagreement of the two views in the half, px of the full size.
+        noise: sigma of the noise of grey values, of 255.
 
     Source: Hirschmüller 2008, as ``match_sgbm``, over a pyramid as in Rothermel et al. 2012, SURE.
     """
-    check_pair(left, right, minimum_px, maximum_px)
-    white = white or white_level(TensorImage(left), TensorImage(right))
-    penalties = round(lambda1 * block_size**2), round(lambda2 * block_size**2)
-    lines, width, _ = left.shape
-    (half_left, left_4), (half_right, right_4) = (_reduced(gray_bytes(image, white)) for image in (left, right))
-    low, high = math.floor(minimum_px / COARSEST), math.ceil(maximum_px / COARSEST)
-    check = round(left_right_check_px / COARSEST)
-    speckle = _COARSE_SPECKLE * speckle_px
-    matcher = sgbm_matcher((low, high), block_size, penalties, check, uniqueness_percent, speckle)
-    coarse = run_sgbm(matcher, left_4, right_4, high)
-    coarse = refine_disparity(left_4, right_4, coarse, window=_COARSE_WINDOW, iterations=1, noise=noise).disparity
+    lines, width = pair.left.shape
+    rows, columns = -(-lines // BLOCK), -(-width // BLOCK)
+    coarse = _search_quarter(_reduced(pair, COARSEST), search, noise)
     filled = fill_from_background(coarse)
     if filled is None:
-        return left.new_full((-(-lines // BLOCK), -(-width // BLOCK)), torch.nan, dtype=torch.float32)
-    near, far = _surfaces(filled)
-    # What is searched for is steep or small: changes cost less than at a quarter of the size. No check is asked of the
-    # search itself, since ``agreeing`` compares what all of them found.
-    steps = _AROUND[1] - _AROUND[0] + 1
-    matcher = sgbm_matcher(_AROUND, block_size, (penalties[0] // 2, penalties[1]), steps, 0, 0)
-    checks = speckle_px, fine_check_px / 2
-    disparity = _at_half_size(matcher, half_left, half_right, (near, far), coarse.isnan(), checks, noise)
-    disparity = disparity[: -(-lines // BLOCK), : -(-width // BLOCK)].mul(BLOCK)
-    return _within(disparity, minimum_px, maximum_px, width)
+        return torch.full((rows, columns), torch.nan)
+    surfaces, missing = _surfaces_around(filled), repeated(coarse, COARSEST // BLOCK).isnan()
+    disparity = _search_half(_reduced(pair, BLOCK), surfaces, missing, search, fine_check_px / BLOCK, noise)
+    return _within_range(disparity[:rows, :columns].mul(BLOCK), search, width)
 
 
-def _at_half_size(
-    matcher: cv2.StereoSGBM,
-    left: Tensor,
-    right: Tensor,
-    surfaces: tuple[Tensor, Tensor],
-    missing: Tensor,
-    checks: tuple[int, float],
-    noise: float,
-) -> Tensor:
-    """Refined disparity at half the size, searched for only where the small copy is in doubt.
+def _reduced(pair: GrayPair, size: int) -> GrayPair:
+    """A copy ``size`` times smaller, by averages; incomplete last blocks of the smallest copy repeat the edge."""
+    lines, width = pair.left.shape
 
-    The doubt follows from the surroundings of a pixel alone, so that the result does not depend on the strip.
-    """
-    (near, far), (speckle_px, limit_px) = surfaces, checks
-    options: dict[str, Any] = {"window": _WINDOW, "iterations": 1, "noise": noise}
-    disparity = refine_disparity(left, right, near, **options, largest_sigma_px=_DOUBTFUL_PX / _WINDOW).disparity
-    wrong, two = disparity.isnan(), near > far
-    disparity = torch.where(wrong, near, disparity)
-    cost = _misfit(left, right, disparity, slice(0, near.shape[1]))
-    doubtful = _around(wrong | two | _repeated(missing, COARSEST // BLOCK))
-    for base, where in ((near, doubtful), (far, two)):
-        for columns in _stretches(where.any(0)):
-            found = _match_around(matcher, left, right, base, columns)
-            misfit = _misfit(left, right, found, columns)
-            better = (misfit < cost[:, columns]).logical_and_(where[:, columns])
-            disparity[:, columns] = torch.where(better, found, disparity[:, columns])
-            cost[:, columns] = torch.where(better, misfit, cost[:, columns])
-    disparity = agreeing(_without_speckles(disparity, speckle_px), cost, limit_px)
-    for columns in _stretches(doubtful.any(0)):
-        part, start = disparity[:, columns], columns.start
-        refined = refine_disparity(left[:, columns], right, part, first_column=start, **options).disparity
-        disparity[:, columns] = torch.where(doubtful[:, columns], refined, part)
-    return disparity
+    def reduced(image: Tensor) -> Tensor:
+        whole = cv2.copyMakeBorder(image.numpy(), 0, -lines % COARSEST, 0, -width % COARSEST, cv2.BORDER_REPLICATE)
+        return torch.from_numpy(cv2.resize(whole, None, fx=1 / size, fy=1 / size, interpolation=cv2.INTER_AREA))
+
+    return GrayPair(reduced(pair.left), reduced(pair.right))
 
 
-def _within(disparity: Tensor, minimum_px: int, maximum_px: int, width: int) -> Tensor:
-    """Disparity of blocks without what lies beyond the range or has its partner beyond the image, ``width`` px wide."""
-    partner = BLOCK * torch.arange(disparity.shape[1]) + (BLOCK - 1) / 2 - disparity
-    # Both columns of a block; the lowest partner is 0, the highest width - 1.
-    seen = (partner - (width - 1) / 2).abs_() <= (width - BLOCK) / 2
-    in_range = (disparity > minimum_px - 1) & (disparity < maximum_px + 1)
-    return torch.where(seen & in_range, disparity, torch.nan)
+def _search_quarter(quarter: GrayPair, search: Search, noise: float) -> Tensor:
+    """Refined disparity over the whole range at a quarter of the size."""
+    coarse_search = replace(
+        search,
+        minimum_px=math.floor(search.minimum_px / COARSEST),
+        maximum_px=math.ceil(search.maximum_px / COARSEST),
+        left_right_check_px=round(search.left_right_check_px / COARSEST),
+        speckle_px=_COARSE_SPECKLE * search.speckle_px,
+    )
+    options = RefineOptions(_QUARTER_WINDOW, iterations=1, noise=noise)
+    return refine_disparity(quarter.left, quarter.right, match_sgbm(quarter, coarse_search), options).disparity
 
 
-def _reduced(image: Tensor) -> tuple[Tensor, Tensor]:
-    """Copies of half and of a quarter of the size, by averages; an incomplete last block repeats the edge."""
-    lines, width = image.shape
-    whole = cv2.copyMakeBorder(image.numpy(), 0, -lines % COARSEST, 0, -width % COARSEST, cv2.BORDER_REPLICATE)
-    copies = (cv2.resize(whole, None, fx=1 / k, fy=1 / k, interpolation=cv2.INTER_AREA) for k in (2, COARSEST))
-    half, quarter = (torch.from_numpy(copy) for copy in copies)
-    return half, quarter
+@dataclass(frozen=True)
+class _Surfaces:
+    """Disparity of the nearest and the farthest surface around each pixel; the same where one search reaches both."""
+
+    near: Tensor
+    far: Tensor
 
 
-def _surfaces(coarse: Tensor) -> tuple[Tensor, Tensor]:
-    """The nearest and the farthest surface around each pixel at half the size, one where they are within reach."""
-    middle = cv2.medianBlur(coarse.numpy(), 5)
+def _surfaces_around(coarse: Tensor) -> _Surfaces:
+    """Surfaces around each pixel of the half, px of it, from the disparity of the quarter without gaps."""
+    middle = cv2.medianBlur(coarse.numpy(), _MEDIAN)
     kernel = cv2.getStructuringElement(cv2.MORPH_RECT, (_NEIGHBOURHOOD, _NEIGHBOURHOOD))
     near, far, middle = (torch.from_numpy(x) for x in (cv2.dilate(middle, kernel), cv2.erode(middle, kernel), middle))
     one = near - far < _TWO_SURFACES_PX
-    size = 2 * coarse.shape[0], 2 * coarse.shape[1]
-    near, far = (_enlarged(2 * torch.where(one, middle, surface), size) for surface in (near, far))
-    return near, far
+    near, far = (enlarged(2 * torch.where(one, middle, surface), 2, _EDGE_PX) for surface in (near, far))
+    return _Surfaces(near, far)
 
 
-def _around(where: Tensor) -> Tensor:
+def _search_half(
+    half: GrayPair, surfaces: _Surfaces, missing: Tensor, search: Search, check_px: float, noise: float
+) -> Tensor:
+    """Refined disparity at half the size, searched for only where the surfaces are in doubt.
+
+    The doubt follows from the surroundings of a pixel alone, so that the result does not depend on the strip.
+
+    Args:
+        missing: where the quarter has no match. check_px: largest disagreement of the two views.
+    """
+    options = RefineOptions(_HALF_WINDOW, iterations=1, noise=noise, largest_sigma_px=_DOUBTFUL_PX / _HALF_WINDOW)
+    near = refine_disparity(half.left, half.right, surfaces.near, options).disparity
+    wrong, two = near.isnan(), surfaces.near > surfaces.far
+    doubtful = _grown(wrong | two | missing)
+    best = BestMatch.of(half, torch.where(wrong, surfaces.near, near))
+    around = _search_around(search)
+    best.search_around(surfaces.near, doubtful, around)
+    best.search_around(surfaces.far, two, around)
+    disparity = agreeing(_without_speckles(best.disparity, search.speckle_px), best.cost, check_px)
+    return _refined_where(half, disparity, doubtful, replace(options, largest_sigma_px=None))
+
+
+def _search_around(search: Search) -> Search:
+    """The search around a surface, px of half the size.
+
+    Disparities around a surface belong to steep or small objects: changes cost less than in the quarter. Views are not
+    compared in each search, since ``agreeing`` compares the best of all searches.
+    """
+    low, high = _AROUND
+    return Search(
+        minimum_px=low,
+        maximum_px=high,
+        block_size=search.block_size,
+        small_change_penalty=search.small_change_penalty // 2,
+        large_change_penalty=search.large_change_penalty,
+        left_right_check_px=high - low + 1,
+        uniqueness_percent=0,
+        speckle_px=0,
+    )
+
+
+def _grown(marked: Tensor) -> Tensor:
     """Pixels where a good part of a small neighbourhood is marked, and those near such pixels."""
-    marked = where.to(torch.uint8).mul_(255).numpy()
-    dense = cv2.threshold(cv2.blur(marked, (_DOUBT_BLOCK, _DOUBT_BLOCK)), _DOUBT_LEVEL, 255, cv2.THRESH_BINARY)[1]
+    marked_bytes = marked.to(torch.uint8).mul_(255).numpy()
+    share = cv2.blur(marked_bytes, (_DOUBT_BLOCK, _DOUBT_BLOCK))
+    dense = cv2.threshold(share, _DOUBT_LEVEL, 255, cv2.THRESH_BINARY)[1]
     kernel = cv2.getStructuringElement(cv2.MORPH_RECT, (2 * _DOUBT_BLOCK + 1, 2 * _DOUBT_BLOCK + 1))
     return torch.from_numpy(cv2.dilate(dense, kernel)) > 0
 
 
-def _repeated(mask: Tensor, times: int) -> Tensor:
-    return mask.repeat_interleave(times, 0).repeat_interleave(times, 1)
-
-
-def _stretches(columns: Tensor) -> list[slice]:
-    """Stretches of marked columns with room for a search on either side."""
-    wide = F.max_pool1d(columns.float()[None], 2 * _ROOM_PX + 1, 1, _ROOM_PX)[0]
-    bounds = F.pad(wide, (1, 1)).diff().nonzero()[:, 0].view(-1, 2)
-    return [slice(start, stop) for start, stop in bounds.tolist()]
-
-
-def _match_around(matcher: cv2.StereoSGBM, left: Tensor, right: Tensor, base: Tensor, columns: slice) -> Tensor:
-    """Disparity in some columns by a search around a base."""
-    base = base[:, columns]
-    column = torch.arange(columns.start, columns.stop, dtype=torch.float32)
-    disparity = base + run_sgbm(matcher, left[:, columns], _sampled(right, column - base), _AROUND[1])
-    partner = column - disparity
-    return torch.where((partner > -0.5) & (partner < right.shape[1] - 0.5), disparity, torch.nan)
-
-
-def _misfit(left: Tensor, right: Tensor, disparity: Tensor, columns: slice) -> Tensor:
-    """How badly the disparity of some columns fits: mean absolute difference over a block."""
-    partner = torch.arange(columns.start, columns.stop, dtype=torch.float32) - disparity
-    difference = cv2.absdiff(_sampled(right, torch.nan_to_num(partner)).numpy(), left[:, columns].numpy())
-    cost = torch.from_numpy(cv2.blur(difference.clip(max=_COST_LIMIT), (_COST_BLOCK, _COST_BLOCK))).to(torch.float32)
-    return torch.where(disparity.isnan(), _NO_MATCH, cost)
-
-
-def _sampled(image: Tensor, column: Tensor) -> Tensor:
-    """Values of an image at fractional columns of each line."""
-    line = torch.arange(column.shape[0], dtype=torch.float32)[:, None].expand_as(column).contiguous()
-    sampled = cv2.remap(image.numpy(), column.numpy(), line.numpy(), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return torch.from_numpy(sampled)
-
-
 def _without_speckles(disparity: Tensor, size: int) -> Tensor:
-    """Disparity without patches of fewer pixels than ``size``, set apart by steps of more than a pixel."""
+    """Disparity without patches of fewer pixels than ``size``; steps of more than a pixel separate patches."""
     steps, missing = 16, -32768
     scaled = torch.nan_to_num(steps * disparity, nan=missing).clamp(missing, -missing - 1).to(torch.int16)
     cv2.filterSpeckles(scaled.numpy(), missing, size, steps)
     return torch.where(scaled == missing, torch.nan, disparity)
 
 
-def _enlarged(disparity: Tensor, size: tuple[int, int]) -> Tensor:
-    """Interpolated between pixels of one surface, taken from the nearest beside an edge; NaN stays NaN."""
-    shape = size[1], size[0]
-    nearest = torch.from_numpy(cv2.resize(disparity.numpy(), shape, interpolation=cv2.INTER_NEAREST))
-    filled = fill_from_background(disparity)
-    if filled is None:
-        return nearest
-    smooth = torch.from_numpy(cv2.resize(filled.numpy(), shape, interpolation=cv2.INTER_LINEAR))
-    # A comparison with NaN is false: what is missing stays.
-    return torch.where((smooth - nearest).abs() < _SMOOTH_PX, smooth, nearest)
+def _refined_where(pair: GrayPair, disparity: Tensor, where: Tensor, options: RefineOptions) -> Tensor:
+    """Disparity whose marked pixels are refined."""
+    result = disparity.clone()
+    for columns in stretches(where.any(0)):
+        part = disparity[:, columns]
+        refined = refine_disparity(pair.left[:, columns], pair.right, part, options, first_column=columns.start)
+        result[:, columns] = torch.where(where[:, columns], refined.disparity, part)
+    return result
+
+
+def _within_range(disparity: Tensor, search: Search, width: int) -> Tensor:
+    """Disparity of blocks without those outside of the range or with a partner outside of the image, ``width`` px."""
+    partner = BLOCK * torch.arange(disparity.shape[1]) + (BLOCK - 1) / 2 - disparity
+    # Both columns of a block: the lowest partner is 0, the highest width - 1.
+    has_partner = (partner - (width - 1) / 2).abs_() <= (width - BLOCK) / 2
+    return torch.where(search.contains(disparity) & has_partner, disparity, torch.nan)

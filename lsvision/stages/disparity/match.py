@@ -1,8 +1,7 @@
-"""Scan -> Disparity -> depth: matching strip by strip, and the depth map that follows from it."""
+"""Scan -> Disparity -> depth: matching of strips, block by block."""
 
 import math
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -10,18 +9,22 @@ from torch import Tensor
 from lsvision.geometry import disparity_at_height
 from lsvision.image.brightness import gray, gray_bytes, white_level
 from lsvision.image.stereo.agreement import occluded
+from lsvision.image.stereo.blocks import block_side, enlarged
 from lsvision.image.stereo.coarse_to_fine import match_coarse_to_fine
-from lsvision.image.stereo.refine import enlarged, refine_disparity
-from lsvision.image.stereo.sgbm import match_sgbm
+from lsvision.image.stereo.refine import RefineOptions, refine_disparity
+from lsvision.image.stereo.sgbm import GrayPair, Search, match_sgbm
+from lsvision.image.tiling import HaloRange
 from lsvision.stages.disparity.config import DisparityConfig
 from lsvision.types import LineImage, Rig, TensorImage
+
+_BLANK_TEST_STEP = 9  # every ninth line shows whether a camera saw anything
 
 
 @dataclass(frozen=True)
 class StripMatch:
-    """Disparity of a strip and its standard deviation, px, ``(lines, width)``; NaN where there is no match.
+    """Disparity of a strip and its sigma, px, ``(lines, width)``; NaN where there is no match.
 
-    Without refinement nothing is known about the deviation: it is NaN everywhere.
+    Without refinement sigma is unknown: NaN everywhere.
     """
 
     disparity: Tensor
@@ -33,7 +36,7 @@ class StripMatch:
 
 
 def disparity_range(rig: Rig, config: DisparityConfig) -> tuple[int, int]:
-    """Lowest and highest disparity, px, that the configured heights ask for on a rig."""
+    """Lowest and highest disparity, px, of the configured heights on a rig."""
     low, high = (disparity_at_height(rig, height) for height in config.height_range_mm)
     return math.floor(low), math.ceil(high)
 
@@ -44,9 +47,9 @@ def match_strip(left: Tensor, right: Tensor, rig: Rig, config: DisparityConfig) 
 
 
 def measure_strip(left: Tensor, right: Tensor, rig: Rig, config: DisparityConfig) -> StripMatch:
-    """Disparity of a pair of strips ``(lines, width, channels)`` and how well it is known.
+    """Disparity and sigma of a pair of strips ``(lines, width, channels)``.
 
-    Nothing is found in a block where one of the cameras saw no more than its noise.
+    A block in which one of the cameras saw no more than its noise has no match anywhere.
     """
     pair = TensorImage(left), TensorImage(right)
     white = white_level(*pair)
@@ -59,56 +62,58 @@ def measure_strip(left: Tensor, right: Tensor, rig: Rig, config: DisparityConfig
 def measure_block(
     left: LineImage, right: LineImage, rig: Rig, config: DisparityConfig, white: float, index: int
 ) -> StripMatch:
-    """Disparity of the block of some index, of images of any length."""
-    start, lines = index * config.block_lines, left.shape[0]
-    stop = min(start + config.block_lines, lines)
-    above, below = max(start - config.halo_lines, 0), min(stop + config.halo_lines, lines)
-    match = _measure(left.read(above, below), right.read(above, below), rig, config.for_width(left.shape[1]), white)
-    inner = slice(start - above, stop - above)
-    return StripMatch(match.disparity[inner], match.sigma[inner])
+    """Disparity and sigma of the lines of one block, of images of any length.
+
+    Args:
+        white: the largest value that pixels can have.
+        index: of the block, which begins at line ``index * config.block_lines``.
+    """
+    lines = HaloRange.at(index * config.block_lines, config.block_lines, config.halo_lines, left.shape[0])
+    pair = (_gray(image.read(lines.outer_start, lines.outer_stop), white) for image in (left, right))
+    match = _measure(*pair, rig, config.for_width(left.shape[1]))
+    return StripMatch(match.disparity[lines.inner], match.sigma[lines.inner])
 
 
-def _measure(left: Tensor, right: Tensor, rig: Rig, config: DisparityConfig, white: float) -> StripMatch:
-    left, right = _gray(left, white), _gray(right, white)
-    disparity = _search(left, right, rig, config)
+def _gray(image: Tensor, white: float) -> Tensor:
+    """Brightness on a scale of 0..255, as is the configured noise: bytes of byte images, float32 of others."""
+    return gray_bytes(image) if image.dtype == torch.uint8 else gray(image) * (255.0 / white)
+
+
+def _measure(left: Tensor, right: Tensor, rig: Rig, config: DisparityConfig) -> StripMatch:
+    """Disparity and sigma of a pair of grey images: search, then refinement."""
+    # In noise alone every pixel would find a match somewhere.
+    if any(float(image[::_BLANK_TEST_STEP].float().std()) <= config.refine_noise for image in (left, right)):
+        disparity = torch.full(left.shape, torch.nan)
+    else:
+        disparity = _search(left, right, rig, config)
     if not config.refine_iterations:
         lines, width = left.shape
-        disparity = enlarged(disparity, -(-lines // disparity.shape[0]))[:lines, :width]
+        disparity = enlarged(disparity, block_side(left, disparity))[:lines, :width]
         return StripMatch(disparity, torch.full_like(disparity, torch.nan))
-    refined = refine_disparity(
-        left,
-        right,
-        disparity,
+    options = RefineOptions(
         window=config.refine_window,
         iterations=config.refine_iterations,
         noise=config.refine_noise,
         largest_sigma_px=config.largest_sigma_px,
     )
+    refined = refine_disparity(left, right, disparity, options)
     return StripMatch(refined.disparity, refined.sigma)
 
 
 def _search(left: Tensor, right: Tensor, rig: Rig, config: DisparityConfig) -> Tensor:
-    # Every tenth or so line tells whether a camera saw anything: in noise alone all would be found to match somewhere.
-    if any(float(image[::9].float().std()) <= config.refine_noise for image in (left, right)):
-        return torch.full(left.shape, torch.nan)
+    """Disparity of a pair of grey images by the configured matcher, for each pixel or for each 2 x 2 pixels."""
     minimum_px, maximum_px = disparity_range(rig, config)
-    options: dict[str, Any] = {
-        "minimum_px": minimum_px,
-        "maximum_px": maximum_px,
-        "block_size": config.block_size,
-        "lambda1": config.lambda1,
-        "lambda2": config.lambda2,
-        "left_right_check_px": config.left_right_check_px,
-        "uniqueness_percent": config.uniqueness_percent,
-        "speckle_px": config.speckle_px,
-        "white": 255.0,
-    }
-    left, right = left[..., None], right[..., None]
+    search = Search(
+        minimum_px=minimum_px,
+        maximum_px=maximum_px,
+        block_size=config.block_size,
+        small_change_penalty=round(config.lambda1 * config.block_size**2),
+        large_change_penalty=round(config.lambda2 * config.block_size**2),
+        left_right_check_px=config.left_right_check_px,
+        uniqueness_percent=config.uniqueness_percent,
+        speckle_px=config.speckle_px,
+    )
+    pair = GrayPair.of(left[..., None], right[..., None], white=255.0)
     if config.matcher == "sgbm":
-        return match_sgbm(left, right, **options)
-    return match_coarse_to_fine(left, right, **options, fine_check_px=config.fine_check_px, noise=config.refine_noise)
-
-
-def _gray(image: Tensor, white: float) -> Tensor:
-    """Brightness on a scale of 0..255, on which the noise is given."""
-    return gray_bytes(image) if image.dtype == torch.uint8 else gray(image) * (255.0 / white)
+        return match_sgbm(pair, search)
+    return match_coarse_to_fine(pair, search, fine_check_px=config.fine_check_px, noise=config.refine_noise)

@@ -42,7 +42,7 @@ def test_filling_by_hand():
     assert fill_from_background(torch.full((2, 3), NAN)) is None
 
 
-def test_occlusion_and_mismatch_are_told_apart():
+def test_occlusion_and_mismatch_are_separated():
     # A surface of disparity 6 from column 20 on before a ground of 0: it hides columns 14..19 from the right camera.
     disparity = torch.zeros(1, 40)
     disparity[:, 20:] = 6.0

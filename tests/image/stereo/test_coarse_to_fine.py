@@ -4,11 +4,10 @@ import pytest
 import torch
 import torch.nn.functional as F  # noqa: N812
 
-from lsvision.image.brightness import gray_bytes, white_level
 from lsvision.image.stereo.coarse_to_fine import match_coarse_to_fine
-from lsvision.image.stereo.refine import refine_disparity
-from lsvision.types import TensorImage
-from tests.image.stereo.test_sgbm import OPTIONS
+from lsvision.image.stereo.refine import RefineOptions, refine_disparity
+from lsvision.image.stereo.sgbm import GrayPair
+from tests.image.stereo.test_sgbm import search
 
 
 def textured(lines: int = 96, width: int = 360) -> torch.Tensor:
@@ -30,10 +29,10 @@ def pair(shift: int) -> tuple[torch.Tensor, torch.Tensor]:
 
 def match(left, right, low=-40, high=40):
     """The search and the refinement that completes it."""
-    start = match_coarse_to_fine(left, right, minimum_px=low, maximum_px=high, fine_check_px=4, noise=1.0, **OPTIONS)
-    white = white_level(TensorImage(left), TensorImage(right))
-    grey = gray_bytes(left, white), gray_bytes(right, white)
-    return refine_disparity(*grey, start, window=9, iterations=1, noise=1.0, largest_sigma_px=0.5).disparity
+    grey = GrayPair.of(left, right)
+    start = match_coarse_to_fine(grey, search(low, high), fine_check_px=4, noise=1.0)
+    options = RefineOptions(window=9, iterations=1, noise=1.0, largest_sigma_px=0.5)
+    return refine_disparity(grey.left, grey.right, start, options).disparity
 
 
 @pytest.fixture
@@ -92,7 +91,7 @@ def test_small_pits_are_found_where_the_small_copy_sees_none():
 
 def test_odd_sizes_have_a_value_for_each_incomplete_block():
     left, right = (image[:95, :279] for image in pair(6))
-    start = match_coarse_to_fine(left, right, minimum_px=-40, maximum_px=40, fine_check_px=4, noise=1.0, **OPTIONS)
+    start = match_coarse_to_fine(GrayPair.of(left, right), search(-40, 40), fine_check_px=4, noise=1.0)
     assert start.shape == (48, 140)
     assert (start[:, 10:-3] - 6).abs().nanmedian() < 0.1
     assert match(left, right).shape == (95, 279)

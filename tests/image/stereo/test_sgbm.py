@@ -4,16 +4,21 @@ import pytest
 import torch
 import torch.nn.functional as F  # noqa: N812
 
-from lsvision.image.stereo.sgbm import match_sgbm
+from lsvision.image.stereo.sgbm import GrayPair, Search, match_sgbm
 
-OPTIONS = {
-    "block_size": 5,
-    "lambda1": 8.0,
-    "lambda2": 32.0,
-    "left_right_check_px": 10,
-    "uniqueness_percent": 5,
-    "speckle_px": 100,
-}
+
+def search(low: int, high: int) -> Search:
+    """The default settings over a range of disparities."""
+    return Search(
+        minimum_px=low,
+        maximum_px=high,
+        block_size=5,
+        small_change_penalty=200,
+        large_change_penalty=800,
+        left_right_check_px=10,
+        uniqueness_percent=5,
+        speckle_px=100,
+    )
 
 
 def textured(lines: int = 80, width: int = 200) -> torch.Tensor:
@@ -28,7 +33,7 @@ def pair(shift: int) -> tuple[torch.Tensor, torch.Tensor]:
 
 
 def match(left, right, low=-24, high=24):
-    return match_sgbm(left, right, minimum_px=low, maximum_px=high, **OPTIONS)
+    return match_sgbm(GrayPair.of(left, right), search(low, high))
 
 
 @pytest.mark.parametrize("shift", [-20, -7, 0, 11, 23])

@@ -9,12 +9,13 @@ import torch
 
 from lsvision.geometry import depth_at, depth_sigma, triangulate, triangulation_jacobian
 from lsvision.image.brightness import gray
-from lsvision.image.stereo.sgbm import match_sgbm
+from lsvision.image.stereo.sgbm import GrayPair, match_sgbm
 from lsvision.simulation import SceneConfig
 from lsvision.stages.disparity.config import DisparityConfig
 from lsvision.stages.disparity.depth import MatchedDepth, depth_of
 from lsvision.stages.disparity.match import StripMatch, disparity_range, measure_strip
 from lsvision.types import DepthView, Scan, StereoPair, StoredDepth, TensorImage, Travel
+from tests.image.stereo.test_sgbm import search
 from tests.stages.rendered import FULL_RIG, PITCH, SMALL_RIG, simulation, stereo_scan
 
 CONFIG = DisparityConfig(block_lines=64, halo_lines=16)
@@ -81,7 +82,7 @@ def test_height_of_a_rendered_plane(sheet, config):
     assert abs(error_px.mean()) < 0.01
 
 
-def test_deviation_is_that_of_the_errors(sheet):
+def test_sigma_is_that_of_the_errors(sheet):
     source, scan = sheet
     matched = MatchedDepth(scan.images, scan.rig, CONFIG)
     read = matched.read(0, scan.lines)
@@ -94,7 +95,7 @@ def test_deviation_is_that_of_the_errors(sheet):
     assert abs(normalised.abs().nanmedian() / 0.6745 - 1) < 0.3
 
 
-def test_deviation_of_depth_follows_the_triangulation():
+def test_sigma_of_depth_follows_the_triangulation():
     disparity, column = torch.tensor([-30.0, 0.0, 12.5]).double(), torch.tensor([10.0, 200.0, 400.0]).double()
     depth = triangulate(SMALL_RIG, column, disparity)[1]
     sigma = torch.tensor([0.02, 0.05, 0.3]).double()
@@ -111,7 +112,7 @@ def test_images_that_match_nothing(sheet, config):
         match = measure_strip(*pair, SMALL_RIG, config)
         assert torch.isfinite(match.disparity).float().mean() < 0.1
     flat = measure_strip(black, black, SMALL_RIG, config)
-    # Without any texture a match says nothing, and its deviation says so.
+    # Without any texture a match carries no information, and sigma shows it.
     assert not (flat.sigma < 0.1).any()
 
 
@@ -129,7 +130,7 @@ def test_mono_and_sixteen_bit_scans_match_alike(sheet, config):
         assert (colour - other)[both].abs().median() < 0.01
 
 
-def test_hidden_pixels_are_told_from_failed_ones():
+def test_hidden_pixels_are_separated_from_failed_ones():
     disparity = torch.zeros(2, 40)
     disparity[:, 20:] = 6.0
     disparity[:, 14:20] = torch.nan
@@ -149,18 +150,7 @@ def test_no_refinement_is_the_matcher_alone(sheet):
     left, right = scan.left.read(0, 64), scan.images.right.read(0, 64)
     config = dataclasses.replace(CONFIG, refine_iterations=0, block_lines=64, halo_lines=0)
     low, high = disparity_range(SMALL_RIG, config)
-    expected = match_sgbm(
-        left,
-        right,
-        minimum_px=low,
-        maximum_px=high,
-        block_size=5,
-        lambda1=8.0,
-        lambda2=32.0,
-        left_right_check_px=10,
-        uniqueness_percent=5,
-        speckle_px=100,
-    )
+    expected = match_sgbm(GrayPair.of(left, right), search(low, high))
     depth = MatchedDepth(scan.images, scan.rig, config).read(0, 64).z
     torch.testing.assert_close(depth, depth_at(SMALL_RIG, expected), equal_nan=True)
 
