@@ -17,8 +17,8 @@ Result = TypeVar("Result")
 
 TILE = (512, 480)  # rows and columns; tall, because a tile sees more scan lines than it has rows
 
-# Positions are rounded to this part of a pixel. Float32 holds such fractions exactly up to 8192 pixels, so that a sample
-# does not depend on the tile from which its position is counted.
+# Positions are rounded to this part of a pixel. Float32 holds such fractions exactly up to 8192 pixels, so that a
+# sample does not depend on the tile from which its position is counted.
 PIXEL_PARTS = 2048
 
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD, _M_ARENA_MAX = -1, -3, -8  # of glibc's malloc.h

@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from lsvision.image.brightness import gray_bytes
-from lsvision.image.resampling import SAMPLED_TILES, Interpolation, Resampler, sample_images
+from lsvision.image.resampling import SAMPLED_TILES, Interpolation, Resampler, Sampling, sample_images
 from lsvision.image.tiling import in_parallel, keep_freed_memory, tiles
 from lsvision.stages.correction.config import CorrectionConfig
 from lsvision.stages.correction.correct import Correction, correct_scan
@@ -117,7 +117,7 @@ def resampling_speeds() -> tuple[dict[str, float], dict[str, float], dict[str, f
 
         def fill(tile: tuple[slice, slice]) -> None:
             out = made[0][tile], made[1][tile]
-            sample_images((color, height), column[tile], line[tile], mode, resampler=resampler, out=out)
+            sample_images((color, height), column[tile], line[tile], Sampling(mode, resampler), out=out)
 
         in_parallel(fill, tiles(len(line), line.shape[1], SAMPLED_TILES[resampler]))
         return made

@@ -43,7 +43,7 @@ def repeated(values: Float[Tensor, "rows columns"], block: int) -> Float[Tensor,
 def enlarged(
     disparity: Float[Tensor, "rows columns"], block: int, largest_step_px: float = _LARGEST_STEP_PX
 ) -> Float[Tensor, "lines width"]:
-    """A disparity for each pixel: interpolated between blocks of one surface, that of its block beside an edge or a gap.
+    """Disparity of each pixel, interpolated between blocks of one surface; beside an edge or a gap that of its block.
 
     Args:
         largest_step_px: largest difference between an interpolated value and that of its block.

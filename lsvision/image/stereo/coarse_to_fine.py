@@ -74,6 +74,7 @@ def _reduced(pair: GrayPair, size: int) -> GrayPair:
     lines, width = pair.left.shape
 
     def reduced(image: Tensor) -> Tensor:
+        # Instead of kornia's pyrdown, another filter (a 5 x 5 Gaussian), which takes 970 times as long.
         whole = cv2.copyMakeBorder(image.numpy(), 0, -lines % COARSEST, 0, -width % COARSEST, cv2.BORDER_REPLICATE)
         return torch.from_numpy(cv2.resize(whole, None, fx=1 / size, fy=1 / size, interpolation=cv2.INTER_AREA))
 

@@ -6,12 +6,13 @@ s / n2 of travel later and in another column (``ProductFrame.shifted_column``).
 
 import math
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Protocol
 
 import torch
 from torch import Tensor
 
 from lsvision.geometry import ProductFrame
+from lsvision.image import resampling
 from lsvision.image.resampling import Interpolation, Resampler, sample_image, sampling_reach
 from lsvision.stages.correction.locate import SeenCells
 from lsvision.types import Scan
@@ -75,8 +76,8 @@ class ColorLines:
     def _sample(
         self, image: Tensor, column: Tensor, line: Tensor, how: Sampling, out: Tensor, first_line: int = 0
     ) -> None:
-        options: dict[str, Any] = {"coarser": self.coarser, "resampler": how.resampler, "first_line": first_line}
-        sample_image(image, column, line, how.interpolation, **options, out=out)
+        sampling = resampling.Sampling(how.interpolation, how.resampler, self.coarser)
+        sample_image(image, column, line, sampling, first_line=first_line, out=out)
 
 
 def color_lines(scan: Scan, frame: ProductFrame, lines: tuple[int, int], spacing: tuple[float, float]) -> ColorLines:

@@ -69,8 +69,8 @@ def measure_block(
         index: of the block, which begins at line ``index * config.block_lines``.
     """
     lines = HaloRange.at(index * config.block_lines, config.block_lines, config.halo_lines, left.shape[0])
-    pair = (_gray(image.read(lines.outer_start, lines.outer_stop), white) for image in (left, right))
-    match = _measure(*pair, rig, config.for_width(left.shape[1]))
+    gray_left, gray_right = (_gray(image.read(lines.outer_start, lines.outer_stop), white) for image in (left, right))
+    match = _measure(gray_left, gray_right, rig, config.for_width(left.shape[1]))
     return StripMatch(match.disparity[lines.inner], match.sigma[lines.inner])
 
 

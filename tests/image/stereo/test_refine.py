@@ -1,7 +1,6 @@
 """Sub-pixel refinement: equal to loops, unbiased on pairs of known shift, and uncertain where there is no texture."""
 
 import math
-from dataclasses import replace
 
 import pytest
 import torch
