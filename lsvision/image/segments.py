@@ -142,7 +142,7 @@ class Segments:
         )
 
     def covers(self, cells: int) -> Tensor:
-        """Which segments are part of the surface and cover at least so many cells."""
+        """Which segments are part of the surface and cover at least a number of cells."""
         return self.surface.connected & (self.count >= cells)
 
     def further_cells(self, cells: int) -> tuple[Tensor, Tensor]:

@@ -1,4 +1,4 @@
-"""What the right camera says about the left one's disparities: agreement, occlusion, and what may lie in the gaps."""
+"""Consistency of the left view's disparities with the right view: agreement, occlusion, and filling of gaps."""
 
 import numpy as np
 import torch
@@ -6,8 +6,8 @@ import torch.nn.functional as F  # noqa: N812
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-_CODE = 4096  # a cost and a whole disparity share one integer
-_NOBODY = 2**30
+_DISPARITIES = 4096  # cost and whole disparity are coded as one integer: cost * 4096 + 2048 + disparity
+_NO_CLAIM = 2**30
 
 
 def agreeing(
@@ -16,25 +16,27 @@ def agreeing(
     """Disparity without the pixels whose partner in the right image fits another pixel better.
 
     A pixel of the right image sees one surface. Of all pixels of the left one that claim it the one of least cost is
-    right; those that differ from it by more than ``limit_px`` are not.
+    right; those whose disparity differs from it by more than ``limit_px`` are wrong.
 
     Args:
         disparity: px, within ±2000, NaN for none.
-        cost: at least 0 and at most 255, in whole numbers.
+        cost: whole numbers from 0 to 255.
     """
     whole = torch.nan_to_num(disparity).round()
     partner, inside = _partner(disparity, whole)
-    claim = torch.where(inside, torch.add(whole, cost, alpha=_CODE).add_(_CODE / 2), _NOBODY).to(torch.int32)
-    best = torch.full_like(claim, _NOBODY).scatter_reduce_(1, partner, claim, "amin").gather(1, partner)
-    winner = best.bitwise_and_(_CODE - 1).sub_(_CODE // 2)
+    claim = torch.where(inside, torch.add(whole, cost, alpha=_DISPARITIES).add_(_DISPARITIES / 2), _NO_CLAIM).to(
+        torch.int32
+    )
+    best = torch.full_like(claim, _NO_CLAIM).scatter_reduce_(1, partner, claim, "amin").gather(1, partner)
+    winner = best.bitwise_and_(_DISPARITIES - 1).sub_(_DISPARITIES // 2)
     return torch.where(((disparity - winner).abs_() <= limit_px).logical_and_(inside), disparity, torch.nan)
 
 
 def occluded(disparity: Float[Tensor, "lines width"], limit_px: float = 1.0) -> Bool[Tensor, "lines width"]:
-    """Which of the pixels without disparity lie behind something the right camera sees, rather than failed to match.
+    """Which of the pixels without disparity are hidden from the right camera, rather than failed to match.
 
-    A gap belongs to the surface behind it. Where the right camera sees a nearer one on the ray to that surface, the
-    pixel is hidden; where it sees none, the match is what failed.
+    A gap belongs to the surface behind it. Where the right camera sees a nearer surface on the ray to that one, the
+    pixel is hidden; elsewhere matching failed.
 
     Source: Hirschmüller 2008, section 2.6.
     """
@@ -42,39 +44,40 @@ def occluded(disparity: Float[Tensor, "lines width"], limit_px: float = 1.0) -> 
     if filled is None:
         return torch.zeros_like(disparity, dtype=torch.bool)
     partner, inside = _partner(disparity, torch.nan_to_num(disparity).round())
-    nearest = torch.where(inside, disparity, -_NOBODY)
-    seen = torch.full_like(disparity, -_NOBODY).scatter_reduce_(1, partner, nearest, "amax")
+    nearest = torch.where(inside, disparity, -_NO_CLAIM)
+    seen = torch.full_like(disparity, -_NO_CLAIM).scatter_reduce_(1, partner, nearest, "amax")
     partner, inside = _partner(filled, filled.round())
     hidden = ~inside | (seen.gather(1, partner) > filled + limit_px)
     return disparity.isnan() & hidden
 
 
 def fill_from_background(disparity: Float[Tensor, "lines width"]) -> Float[Tensor, "lines width"] | None:
-    """Gaps filled with the farther of the disparities at their two ends; lines without any with the median of all.
+    """Fill gaps with the farther of the disparities at their two ends, and empty lines with the median of all.
 
-    None where nothing is known.
+    Returns:
+        None where no pixel has a disparity.
     """
-    known = (disparity == disparity).numpy()  # not NaN
-    if known.all():
+    valid = (disparity == disparity).numpy()  # not NaN
+    if valid.all():
         return disparity
-    if not known.any():
+    if not valid.any():
         return None
     width = disparity.shape[1]
     column = np.arange(width, dtype=np.int32)
-    before = np.maximum.accumulate(np.where(known, column, -1), axis=1)
-    after = np.minimum.accumulate(np.where(known, column, width)[:, ::-1], axis=1)[:, ::-1]
-    # A column of infinity on either side is what the ends of a line without a neighbour refer to.
+    before = np.maximum.accumulate(np.where(valid, column, -1), axis=1)
+    after = np.minimum.accumulate(np.where(valid, column, width)[:, ::-1], axis=1)[:, ::-1]
+    # Ends without a valid neighbour refer to a column of infinity on either side.
     padded = F.pad(disparity, (1, 1), value=torch.inf)
     left, right = (padded.gather(1, torch.from_numpy(end + np.int64(1))) for end in (before, after))
     filled = torch.minimum(left, right)
-    empty = torch.from_numpy(~known.any(1))
+    empty = torch.from_numpy(~valid.any(1))
     if bool(empty.any()):
         filled[empty] = disparity.nanmedian()
     return filled
 
 
 def _partner(disparity: Tensor, whole: Tensor) -> tuple[Tensor, Tensor]:
-    """Column of the right image, clamped to it, and whether there is one."""
+    """Column of the partner in the right image, clamped to it, and whether it lies inside."""
     width = disparity.shape[1]
     column = torch.arange(width, dtype=whole.dtype) - whole
     inside = torch.isfinite(disparity) & (column >= 0) & (column < width)

@@ -4,7 +4,7 @@
 2. ``_search_quarter``: the whole range is searched at a quarter of the size, which holds a sixteenth of the pixels and
    a quarter of the disparities. On smooth ground the refined result is good to half a pixel of the quarter, within
    reach of a refinement at half the size.
-3. ``_surfaces_around``: around each pixel of the half the nearest and the farthest surface are known from there.
+3. ``_surfaces_around``: the quarter gives the nearest and the farthest surface around each pixel of the half.
 4. ``_search_half``: the nearest surface is refined at half the size. Pixels are in doubt where this leaves residuals
    above noise, where the quarter has no match, and beside an edge, where a block sees two surfaces. There both surfaces
    are searched around (``BestMatch.search_around``), the disparity that fits best is kept, pixels that contradict the
@@ -36,8 +36,8 @@ _TWO_SURFACES_PX = 5.0
 _MEDIAN, _NEIGHBOURHOOD = 5, 5
 _EDGE_PX = 2.0  # a larger step between neighbours is an edge, over which nothing is interpolated
 _COARSE_SPECKLE = 2  # times the pixels of a speckle: a pixel removed from the quarter is searched again in the half
-# The residual of the refinement is above noise where a shift by less, px of half the size, does not explain it; a pixel
-# is in doubt where this holds for more than so many of 255 parts of a neighbourhood.
+# The residual of the refinement is above noise where no shift by less than this, px of half the size, explains it. A
+# pixel is in doubt where this holds for more than the level, of 255, of the block around it.
 _DOUBTFUL_PX = 0.45
 _DOUBT_BLOCK, _DOUBT_LEVEL = 9, 48
 _HALF_WINDOW, _QUARTER_WINDOW = 9, 7  # of the refinement

@@ -1,4 +1,4 @@
-"""Values of an image at fractional columns of its own lines."""
+"""Values of an image at fractional columns of its lines."""
 
 import cv2
 import torch

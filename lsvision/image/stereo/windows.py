@@ -41,7 +41,7 @@ class Windows:
         mean_a: Float[Tensor, "rows columns"],
         mean_b: Float[Tensor, "rows columns"],
     ) -> Float[Tensor, "rows columns"]:
-        """Covariance over each window of two maps whose means are known: mean(a b) - mean(a) mean(b)."""
+        """Covariance over each window of two maps from their means: mean(a b) - mean(a) mean(b)."""
         return self.mean(a * b).addcmul_(mean_a, mean_b, value=-1)
 
 
