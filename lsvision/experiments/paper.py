@@ -17,7 +17,16 @@ from lsvision.geometry import displace
 from lsvision.io import Product, read_product, read_scan, write_calibration, write_text
 from lsvision.report.paper_pages import PAPER, BoardCheck, Scenario, write_paper_report
 from lsvision.report.progress import ProgressBars, progress_bars
-from lsvision.simulation import BoardPose, MotionConfig, SceneConfig, SensorConfig, Simulation, scaled_rig, simulate
+from lsvision.simulation import (
+    Acquisition,
+    BoardPose,
+    MotionConfig,
+    SceneConfig,
+    SensorConfig,
+    Simulation,
+    scaled_rig,
+    simulate,
+)
 from lsvision.simulation.sheet_points import points_in_product, points_in_scan
 from lsvision.stages.calibration.calibrate import calibrate
 from lsvision.stages.calibration.config import CalibrationConfig
@@ -133,7 +142,7 @@ def _simulations(settings: PaperSettings, motion: MotionConfig) -> dict[str, Sim
             scene,
             replace(motion, seed=motion.seed + index),
             replace(settings.sensor, seed=settings.sensor.seed + index),
-            settings.line_pitch_mm * settings.scale,
+            Acquisition(settings.line_pitch_mm * settings.scale),
         )
         for index, (name, scene) in enumerate(scenes.items())
     }

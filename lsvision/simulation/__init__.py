@@ -2,10 +2,11 @@
 
 from lsvision.simulation.artwork import artwork
 from lsvision.simulation.config import BoardPose, EncoderConfig, MotionConfig, SceneConfig, SensorConfig
-from lsvision.simulation.scan import Simulation, scaled_rig, simulate
+from lsvision.simulation.scan import Acquisition, Simulation, scaled_rig, simulate
 from lsvision.simulation.trajectory import Trajectory
 
 __all__ = [
+    "Acquisition",
     "BoardPose",
     "EncoderConfig",
     "MotionConfig",

@@ -1,4 +1,4 @@
-"""Where a target stands and what lies around it."""
+"""Pose of a target, and the conveyor and lights around it."""
 
 import math
 
@@ -9,7 +9,7 @@ from lsvision.geometry import product_axes, rotation_from_vector
 from lsvision.simulation.config import SceneConfig
 from lsvision.simulation.lighting import line_lights
 from lsvision.simulation.rail import RailScene
-from lsvision.simulation.surfaces import BoardScene, Conveyor, Scene, SheetScene, board_extent
+from lsvision.simulation.surfaces import BoardScene, Conveyor, Scene, SheetScene, squares_of
 from lsvision.types import Board, Pose, Rig
 
 
@@ -53,9 +53,10 @@ def build_scene(rig: Rig, board: Board, scene: SceneConfig, pose: Pose, n: Tenso
 def _outline(board: Board, scene: SceneConfig) -> Tensor:
     """Corners (4, 2) of a board or sheet in its own frame, mm."""
     if scene.kind == "board":
-        side, right, bottom = board_extent(board)
+        squares = squares_of(board)
         border = torch.tensor([scene.board_border_x_mm, scene.board_border_y_mm], dtype=torch.float64)
-        low, high = -side - border, torch.tensor([right, bottom], dtype=torch.float64) + border
+        low = -squares.side_mm - border
+        high = torch.tensor([squares.right_mm, squares.bottom_mm], dtype=torch.float64) + border
     else:
         high = torch.tensor([scene.sheet_width_mm, scene.sheet_height_mm], dtype=torch.float64)
         low = torch.zeros_like(high)

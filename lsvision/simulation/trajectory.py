@@ -8,16 +8,16 @@ with Rroll a rotation about Y and c = (B/2, 0, z0). Without vibration that is p 
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from lsvision.simulation.config import EncoderConfig, MotionConfig
 from lsvision.simulation.noise import lattice_hash
-from lsvision.types import Rig, Transport
+from lsvision.types import Pose, Rig, Transport
 
-# One phase stream per thing that swings.
+# Each quantity that swings draws its phases from a stream of random numbers of its own.
 _X, _Z, _ROLL, _WOBBLE = range(4)
 # Fixed-point steps that invert the uneven travel; each gains at least a digit for any wobble a log can follow.
 _INVERSION_STEPS = 40
@@ -75,14 +75,16 @@ class Trajectory:
             dim=-1,
         )
 
-    def project(self, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """x (mm), line and z (mm) at which the object's own points ``(*batch, 3)``, mm, cross the scan plane."""
+    def project(self, points: Tensor) -> Tensor:
+        """Places (x mm, line, z mm), ``(*batch, 3)``, where the object's own points, mm, cross the scan plane."""
         y = points[..., 1].double() / self.n[1]  # neither roll about Y nor dx, dz moves a point along Y
         line = self.line_at(y)
         dx, dz, roll = self.vibration(line).unbind(-1)
         x, _, z = (points - y[..., None] * self.n - self.pivot).unbind(-1)
         cos, sin = torch.cos(roll), torch.sin(roll)
-        return cos * x + sin * z + self.pivot[0] + dx, line, cos * z - sin * x + self.pivot[2] + dz
+        return torch.stack(
+            [cos * x + sin * z + self.pivot[0] + dx, line, cos * z - sin * x + self.pivot[2] + dz], dim=-1
+        )
 
     def _wobble(self, even: Tensor) -> Tensor:
         if not self.encoder.enabled:
@@ -106,9 +108,28 @@ class Rays:
     camera_x_mm: float
     middle_slope: float
 
-    def within(self, rotation: Tensor, translation: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Origin, across and ahead seen from a frame with ``p = rotation p_frame + translation``."""
-        return (self.origin - translation) @ rotation, self.across @ rotation, self.ahead @ rotation
+    def in_frame(self, pose: Pose) -> "Rays":
+        """The same rays in the coordinates of a target's frame; depths and slopes stay those of the scan frame."""
+        rotation, translation = pose.rotation, pose.translation
+        return replace(
+            self,
+            origin=(self.origin - translation) @ rotation,
+            across=self.across @ rotation,
+            ahead=self.ahead @ rotation,
+        )
+
+    def on_columns(self, columns: slice) -> "Rays":
+        """The rays of some columns."""
+        return replace(self, slope=self.slope[columns])
+
+    def direction(self, axis: int) -> Tensor:
+        """One coordinate of every ray's direction, ``(lines, columns)`` float32, mm per mm of depth."""
+        across, ahead = self.across[:, axis].float(), self.ahead[:, axis].float()
+        return torch.addcmul(ahead[:, None], across[:, None], self.slope[None])
+
+    def scan_x(self, z: Tensor) -> Tensor:
+        """x in the scan frame, mm, of the points at depths z ``(lines, columns)``, mm."""
+        return (self.slope[None] + self.middle_slope).mul(z).add_(self.camera_x_mm)
 
 
 def cast_rays(trajectory: Trajectory, camera: str, columns: Tensor, lines: Tensor, plane_y_mm: float = 0.0) -> Rays:

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from lsvision.image.board.detect import detect_board, order_grid
 from lsvision.image.brightness import gray
-from lsvision.simulation import MotionConfig, SceneConfig, SensorConfig, simulate
+from lsvision.simulation import Acquisition, MotionConfig, SceneConfig, SensorConfig, simulate
 from lsvision.types import Board, Rig, TensorImage
 
 RIG = Rig(7142, 10.0, 113.84, 354.0, 1042.0, 6099.0)
@@ -52,7 +52,7 @@ def _rendered() -> tuple[Tensor, Tensor]:
     scene = SceneConfig("board", pitch_deg=2.0, roll_deg=1.5, yaw_deg=8.0, texture_mm=0.15, board_texture=0.0)
     motion = MotionConfig(angle_x_deg=3.0, stretch=1.0246)
     sensor = SensorConfig(noise=3.0, blur_px=1.0, supersampling=2)
-    source = simulate(RIG, BOARD, scene, motion, sensor, 0.07)
+    source = simulate(RIG, BOARD, scene, motion, sensor, Acquisition(0.07))
     return torch.cat(list(source.strips("left"))), source.corners()[0]
 
 

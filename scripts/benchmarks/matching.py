@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from lsvision.image.tiling import keep_freed_memory
-from lsvision.simulation import MotionConfig, SceneConfig, SensorConfig, simulate
+from lsvision.simulation import Acquisition, MotionConfig, SceneConfig, SensorConfig, simulate
 from lsvision.stages.disparity.config import DisparityConfig
 from lsvision.stages.disparity.match import StripMatch, measure_strip
 from lsvision.types import Board, Rig
@@ -70,7 +70,7 @@ def _peer(left: Tensor, right: Tensor) -> StripMatch:
 def _rendered(scene: SceneConfig) -> tuple[Tensor, Tensor, Tensor]:
     motion = MotionConfig(angle_x_deg=-1.5, angle_z_deg=0.8, stretch=1.0246)
     sensor = SensorConfig(noise=2.0, supersampling=2)
-    source = simulate(RIG, Board(12, 9, 30.0), scene, motion, sensor, 0.07, lines=LINES)
+    source = simulate(RIG, Board(12, 9, 30.0), scene, motion, sensor, Acquisition(0.07, lines=LINES))
     left, right = (torch.cat(list(source.strips(camera))) for camera in ("left", "right"))
     depth = torch.cat(list(source.depth_strips())).double()
     convergence = RIG.principal_right_px - RIG.principal_left_px

@@ -73,19 +73,19 @@ def test_light_is_one_in_the_middle_symmetric_and_falls_off(small_rig):
 
 def test_defects_are_the_same_in_any_piece_and_return_with_the_roll():
     scene = SceneConfig("rail", defect_spacing_mm=80.0, roll_mark_period_mm=50.0)
-    whole_depth, whole_factor = defects(scene, Nodes(-80, 0, 160, 1000, 0.4), 3)
-    depth, factor = defects(scene, Nodes(-20, 300, 60, 200, 0.4), 3)
-    torch.testing.assert_close(depth, whole_depth[300:500, 60:120])
-    torch.testing.assert_close(factor, whole_factor[300:500, 60:120])
+    whole = defects(scene, Nodes(-80, 0, 160, 1000, 0.4), 3)
+    piece = defects(scene, Nodes(-20, 300, 60, 200, 0.4), 3)
+    torch.testing.assert_close(piece.depth_mm, whole.depth_mm[300:500, 60:120])
+    torch.testing.assert_close(piece.factor, whole.factor[300:500, 60:120])
     marks = SceneConfig("rail", defect_spacing_mm=0.0, roll_mark_period_mm=50.0)
-    depth, factor = defects(marks, Nodes(-80, 0, 160, 1000, 0.4), 3)
-    torch.testing.assert_close(depth[:250], depth[250:500])
-    assert 0.3 < depth.max() < 0.5
-    assert factor.min() > 0
+    relief = defects(marks, Nodes(-80, 0, 160, 1000, 0.4), 3)
+    torch.testing.assert_close(relief.depth_mm[:250], relief.depth_mm[250:500])
+    assert 0.3 < relief.depth_mm.max() < 0.5
+    assert relief.factor.min() > 0
     sound = SceneConfig("rail", defect_spacing_mm=0.0, roll_mark_period_mm=0.0)
-    depth, factor = defects(sound, Nodes(0, 0, 4, 4, 0.4), 0)
-    assert (depth == 0).all()
-    assert (factor == 1).all()
+    relief = defects(sound, Nodes(0, 0, 4, 4, 0.4), 0)
+    assert (relief.depth_mm == 0).all()
+    assert (relief.factor == 1).all()
 
 
 def test_samples_tile_their_pixels():
