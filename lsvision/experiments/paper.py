@@ -1,7 +1,7 @@
 """``+experiment=paper``: Wang et al. 2024 redone on scan files, start to end.
 
 Renders boards, a sheet and a rail, writes them as scan folders, reads them back, calibrates by both methods, corrects
-everything and holds the figures against the paper's; once without vibration and once with.
+everything and compares the figures with the paper's; once without vibration and once with.
 """
 
 import json
@@ -15,7 +15,8 @@ from lsvision.experiments.settings import RunSettings
 from lsvision.experiments.simulate import write_simulation
 from lsvision.geometry import displace
 from lsvision.io import Product, read_product, read_scan, write_calibration, write_text
-from lsvision.report.paper_pages import PAPER, BoardCheck, Scenario, write_paper_report
+from lsvision.report.paper_pages import write_paper_report
+from lsvision.report.paper_scenario import PAPER, BoardCheck, Scenario
 from lsvision.report.progress import ProgressBars, progress_bars
 from lsvision.simulation import (
     Acquisition,
@@ -151,14 +152,16 @@ def _simulations(settings: PaperSettings, motion: MotionConfig) -> dict[str, Sim
 def _check_board(board: Board, corners: BoardCorners, product: Product) -> BoardCheck:
     """Distances between a board's corners at nominal motion and in the product."""
     nominal = displace(corners.points, corners.points.new_tensor([0.0, 1.0, 0.0]))
-    before = distance_errors(nominal, board, corners.valid)
+    neighbours_mm, pairs_mm = distance_errors(nominal, board, corners.valid)
     measured = measure_board(*_in_memory(product), board)
     if measured is None:
-        return BoardCheck(0, before, (float("nan"), float("nan")), None)
+        return BoardCheck(0, neighbours_mm, pairs_mm)
     return BoardCheck(
         corners=int(measured.valid.sum()),
-        before_mm=before,
-        after_mm=(measured.neighbour_rms_mm, measured.distance_rms_mm),
+        neighbours_before_mm=neighbours_mm,
+        pairs_before_mm=pairs_mm,
+        neighbours_after_mm=measured.neighbour_rms_mm,
+        pairs_after_mm=measured.distance_rms_mm,
         points=measured.points,
     )
 
