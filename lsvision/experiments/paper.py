@@ -1,7 +1,7 @@
-"""``+experiment=paper``: Wang et al. 2024 redone on scan files, start to end.
+"""``+experiment=paper``: Wang et al. 2024 redone on scan files, from start to end.
 
 Renders boards, a sheet and a rail, writes them as scan folders, reads them back, calibrates by both methods, corrects
-everything and compares the figures with the paper's; once without vibration and once with.
+all scans and compares the figures with the paper's: once without vibration and once with it.
 """
 
 import json
@@ -10,7 +10,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 from lsvision.experiments.correct import write_product
-from lsvision.experiments.parallel import scan_pool
+from lsvision.experiments.parallel import map_names, scan_pool
 from lsvision.experiments.settings import RunSettings
 from lsvision.experiments.simulate import write_simulation
 from lsvision.geometry import displace
@@ -65,7 +65,7 @@ class PaperSettings(RunSettings):
 
 
 def run_paper(settings: PaperSettings, folder: Path) -> None:
-    """Both scenarios, then the summary and the report."""
+    """Run both scenarios, then write the summary and the report."""
     scenarios = {}
     with progress_bars() as bars:
         for name, motion in (("still", settings.still), ("vibrating", settings.vibrating)):
@@ -87,28 +87,28 @@ def run_paper(settings: PaperSettings, folder: Path) -> None:
 def _scenario(settings: PaperSettings, motion: MotionConfig, folder: Path, bars: ProgressBars) -> Scenario:
     """Render, read back, calibrate by both methods, correct and measure, for one motion."""
     simulations = _simulations(settings, motion)
-    names = list(simulations)
     with scan_pool(settings.threads) as pool:
-        rendered = pool.map(lambda name: _rendered(simulations[name], folder / name, bars), names)
-        scans = dict(zip(names, rendered, strict=True))
-        boards = {name: scan for name, scan in scans.items() if name.startswith("board")}
-        found = pool.map(lambda scan: find_corners(scan, settings.board, settings.corners), boards.values())
-        corners = dict(zip(boards, found, strict=True))
 
-        rig = scans["sheet"].rig
-        joint = calibrate(list(corners.values()), rig, settings.joint)
-        two_step = calibrate([next(iter(corners.values()))], rig, settings.two_step)
-        for method, calibration in (("joint", joint), ("two_step", two_step)):
-            write_calibration(calibration, folder / f"calibration_{method}.json")
+        def rendered(name: str) -> Scan:
+            write_simulation(simulations[name], folder / name, bars)
+            return read_scan(folder / name)
+
+        scans = map_names(pool, rendered, simulations)
+        boards = [name for name in scans if name.startswith("board")]
+        corners = map_names(pool, lambda name: find_corners(scans[name], settings.board, settings.corners), boards)
+
+        joint = calibrate(list(corners.values()), scans["sheet"].rig, settings.joint)
+        two_step = calibrate([corners[boards[0]]], scans["sheet"].rig, settings.two_step)
+        write_calibration(joint, folder / "calibration_joint.json")
+        write_calibration(two_step, folder / "calibration_two_step.json")
 
         def corrected(name: str) -> Product:
             target = folder / f"{name}.zarr"
             write_product(scans[name], joint.motion, settings.disparity, settings.correction, target, bars)
             return read_product(target)
 
-        products = dict(zip(names, pool.map(corrected, names), strict=True))
-        checked = pool.map(lambda name: _check_board(settings.board, corners[name], products[name]), boards)
-        checks = dict(zip(boards, checked, strict=True))
+        products = map_names(pool, corrected, scans)
+        checks = map_names(pool, lambda name: _check_board(settings.board, corners[name], products[name]), boards)
     sheet = simulations["sheet"]
     color, height, grid = _in_memory(products["sheet"])
     return Scenario(
@@ -123,11 +123,6 @@ def _scenario(settings: PaperSettings, motion: MotionConfig, folder: Path, bars:
     )
 
 
-def _rendered(simulation: Simulation, folder: Path, bars: ProgressBars) -> Scan:
-    write_simulation(simulation, folder, bars)
-    return read_scan(folder)
-
-
 def _simulations(settings: PaperSettings, motion: MotionConfig) -> dict[str, Simulation]:
     """The scans of a scenario by name: board_1, board_2, .., sheet, rail."""
     scenes = {
@@ -136,7 +131,7 @@ def _simulations(settings: PaperSettings, motion: MotionConfig) -> dict[str, Sim
     scenes |= {"sheet": settings.sheet, "rail": settings.rail}
     rig = scaled_rig(settings.rig, settings.scale)
     return {
-        # Each pass meets another phase of the vibration and other noise.
+        # Each scan has another phase of the vibration and other noise.
         name: simulate(
             rig,
             settings.board,

@@ -1,4 +1,4 @@
-"""Figures, the self-contained HTML report and the summary in words."""
+"""Figures, self-contained HTML reports, and the summary of a calibration in words."""
 
 from lsvision.report.experiment_pages import calibration_report, product_report
 from lsvision.report.pages import Headline, Page, ReportFigure, Table, write_report

@@ -1,4 +1,4 @@
-"""Report of a sweep: its jobs with what was varied and what came out, and why some failed."""
+"""Report of a sweep: options and results of its jobs, and the reasons of the failures."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ _MOST_PANELS = 6
 
 @dataclass(frozen=True)
 class SweepJob:
-    """One job of a sweep: its folder's name, overrides, why it failed ("" if not), seconds, and results by name."""
+    """One job of a sweep: name of its folder, overrides, reason of its failure or "", seconds, results by name."""
 
     name: str
     overrides: list[str]
@@ -30,7 +30,7 @@ class SweepJob:
 
 @dataclass(frozen=True)
 class Sweep:
-    """The jobs of a sweep, and the options and results that are worth showing."""
+    """The jobs of a sweep, and which of their options and results a page shows."""
 
     jobs: Sequence[SweepJob]
 
@@ -41,7 +41,7 @@ class Sweep:
 
     @property
     def failed(self) -> list[SweepJob]:
-        """Jobs without."""
+        """Jobs without a result."""
         return [job for job in self.jobs if job.reason]
 
     def varied_options(self) -> list[str]:

@@ -1,4 +1,4 @@
-"""Line-scan renderer: boards, sheets and rails under a stereo rig, with their motion and its truth."""
+"""Line-scan renderer: boards, printed sheets and rails in motion under a stereo rig, with the truth."""
 
 from lsvision.simulation.artwork import artwork
 from lsvision.simulation.config import BoardPose, EncoderConfig, MotionConfig, SceneConfig, SensorConfig

@@ -10,7 +10,7 @@ from lsvision.simulation.config import SceneConfig
 from lsvision.simulation.noise import Nodes, Raster, lattice_hash, octaves, value_noise
 
 _GRAIN_OCTAVES = 6
-_COLOR_CELLS = 5  # colour varies from the octave of 2**5 dots upwards
+_COLOR_CELLS = 5  # the hue has no finer octave than that of 2**5 dots
 _RINGS, _CROSSES = 8, 8
 _FRAME_MM, _FRAME_INSET_MM = 1.2, 6.0
 _RULER_STEP_MM = 5.0
@@ -63,17 +63,17 @@ def sheet_raster(scene: SceneConfig) -> Raster:
 
 
 def _print(color: Tensor, share: Tensor, ink: tuple[float, float, float]) -> Tensor:
-    """Lay an ink over the dots, each covered by the given share."""
+    """Print an ink over a share of every dot."""
     return torch.lerp(color, color.new_tensor(ink)[:, None, None].expand_as(color), share[None])
 
 
 def _stroke(distance: Tensor, width: float, dot: float) -> Tensor:
-    """Coverage of dots at a distance from the middle of a stroke, mm."""
+    """Share of a dot that a stroke covers, from its distance to the middle of the stroke; all in mm."""
     return ((width / 2 - distance) / dot + 0.5).clamp(0.0, 1.0)
 
 
 def _border(scene: SceneConfig, x: Tensor, y: Tensor) -> Tensor:
-    """A frame, and a ruler inside its lower edge with a longer tick every tenth step."""
+    """A frame, and a ruler inside its lower edge with longer ticks at every second and tenth step."""
     width, height, dot = scene.sheet_width_mm, scene.sheet_height_mm, scene.texture_mm
     to_edge = torch.minimum(torch.minimum(x, width - x), torch.minimum(y, height - y)) - _FRAME_INSET_MM
     tick = (x / _RULER_STEP_MM).round()

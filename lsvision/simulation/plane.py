@@ -53,7 +53,7 @@ def view_plane(rays: Rays, pose: Pose, spacing_mm: float) -> PlaneView:
 def footprint(position: Tensor) -> float:
     """Width, mm, of the box that one sample covers along an axis, from the positions ``(h, w)`` of all samples.
 
-    It has the variance of the sample's true, turned footprint: sides along the sensor and along the motion add squared.
+    It has the variance of the true, turned footprint, whose sides along the sensor and along the motion add in squares.
     """
     i, j = position.shape[0] // 2, position.shape[1] // 2
     here = position[i, j]

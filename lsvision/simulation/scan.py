@@ -22,8 +22,8 @@ from lsvision.types import Board, Pose, Rig, Transport, Travel
 
 Camera = Literal["left", "right"]
 
-# Lines rendered at once. Blocks lie at multiples of it whatever strips are asked for, so every strip height gives the
-# same bits; 32 lines of samples stay near the processor's cache.
+# Lines rendered at once. Blocks begin at multiples of it, so that strips of every height have the same bits; 32 lines
+# of samples fit the processor's cache.
 _BLOCK = 32
 _LOG_STREAM = 7
 
@@ -95,7 +95,7 @@ class Simulation:
         return torch.stack([left, line], dim=-1), torch.stack([right, line], dim=-1)
 
     def truth(self) -> dict[str, Any]:
-        """What was simulated, as plain values for a JSON file.
+        """The truth of the scan as plain values for a JSON file.
 
         ``n``, ``stretch``, ``R``, ``T``, ``lines``, the settings under ``args``, and for a board its corners as
         (column, line) in the order of ``Board.corner_points``.
@@ -143,7 +143,7 @@ class Simulation:
         return Look(torch.stack([look.color[c] for c, look in enumerate(looks)]), looks[1].z)
 
     def _look_channel(self, camera: Camera, columns: Tensor, lines: Tensor, spacing: float) -> Look:
-        """One colour, seen ``spacing`` lines further along Y; a registering camera takes it that much sooner."""
+        """One colour, seen ``spacing`` lines further along Y, and that much earlier if the camera registers colours."""
         if self.sensor.color_registered:
             lines = lines - self.trajectory.sign * spacing
         plane_y = spacing * self.trajectory.line_pitch_mm

@@ -14,9 +14,9 @@ from lsvision.types import Board, Pose, Rig
 
 
 def place(rig: Rig, board: Board, scene: SceneConfig, n: Tensor, middle_mm: float) -> Pose:
-    """Pose of a target whose centre crosses the scan plane midway between the cameras after a travel of ``middle_mm``.
+    """Pose of a target whose centre crosses the scan plane midway between the cameras at the travel ``middle_mm``.
 
-    A rail's frame has its Y along the motion n; roll turns it about that axis.
+    Y of a rail's frame runs along the motion n; roll turns the rail about it.
     """
     depth = rig.zero_disparity_mm + scene.depth_offset_mm
     middle = n.new_tensor([rig.baseline_mm / 2, 0.0, depth]) + middle_mm * n
@@ -39,7 +39,7 @@ def scene_lines(board: Board, scene: SceneConfig, n: Tensor, line_pitch_mm: floa
 
 
 def build_scene(rig: Rig, board: Board, scene: SceneConfig, pose: Pose, n: Tensor) -> Scene:
-    """Target, conveyor and lights; n is the motion along which conveyor and rail run."""
+    """Target, conveyor and lights; conveyor and rail run along the motion n."""
     lighting = line_lights(rig)
     ground = n.new_tensor([rig.baseline_mm / 2, 0.0, rig.zero_disparity_mm + scene.conveyor_drop_mm])
     conveyor = Conveyor(Pose(product_axes(n).mT, ground), lighting, scene.texture_mm, scene.seed)

@@ -1,6 +1,6 @@
-"""The true motion of the object: where each of its points is on each line, and the rays that see it.
+"""The true motion of the object: the position of its points on every line, and the rays that see them.
 
-On line v the object's own point p stands in the scan frame at
+On line v the object's own point p lies in the scan frame at
 
     P = Rroll(v) (p - y n - c) + c + (dx(v), 0, dz(v)),     y = the true nominal travel of line v,
 
@@ -17,9 +17,9 @@ from lsvision.simulation.config import EncoderConfig, MotionConfig
 from lsvision.simulation.noise import lattice_hash
 from lsvision.types import Pose, Rig, Transport
 
-# Each quantity that swings draws its phases from a stream of random numbers of its own.
+# One stream of random phases for each quantity that swings.
 _X, _Z, _ROLL, _WOBBLE = range(4)
-# Fixed-point steps that invert the uneven travel; each gains at least a digit for any wobble a log can follow.
+# Fixed-point steps that invert the uneven travel; each gains a digit or more for any wobble that a log can follow.
 _INVERSION_STEPS = 40
 
 
@@ -94,7 +94,7 @@ class Trajectory:
 
 @dataclass(frozen=True)
 class Rays:
-    """What one camera's columns see on some lines, in the object's own coordinates.
+    """Rays of one camera's columns on some lines, in the object's own coordinates.
 
     The point at depth z on column j of line i is ``origin[i] + z (slope[j] across[i] + ahead[i])``; in the scan frame
     its x is ``camera_x_mm + z (slope[j] + middle_slope)``. Lines are float64, slopes float32 about the middle column,
@@ -138,7 +138,8 @@ def cast_rays(trajectory: Trajectory, camera: str, columns: Tensor, lines: Tenso
     Args:
         trajectory: the true motion.
         camera: "left" or "right".
-        plane_y_mm: Y of the plane that the sensor line looks at; zero but for a trilinear sensor.
+        columns, lines: positions, px and lines.
+        plane_y_mm: Y of the plane that the sensor line sees; zero except for a trilinear sensor.
     """
     rig = trajectory.rig
     left = camera == "left"
