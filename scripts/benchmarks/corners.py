@@ -1,7 +1,7 @@
-"""Corners of a board at full size: this library against OpenCV's findChessboardCornersSB on the same image, one thread.
+"""Corners of a full-size board, compared with OpenCV's findChessboardCornersSB on the same image, one thread.
 
 The image is rendered: 7142 px wide, noise 3 of 255, blur 1 px, sheared and stretched as a moving board is. Errors are
-those against the renderer's truth.
+differences from the renderer's truth.
 """
 
 import math
@@ -22,7 +22,7 @@ TURNS = 3
 
 
 def run() -> dict[str, object]:
-    """Seconds and errors of both; ``ratio`` is OpenCV's time over ours, by the best turn of each."""
+    """Seconds and errors of both; ``ratio`` is OpenCV's time over ours in the best turn of each."""
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
     image, truth = _rendered()

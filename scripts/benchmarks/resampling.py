@@ -1,8 +1,8 @@
-"""Correction of full-width scans against OpenCV, in one run on one machine, on as many threads as torch takes.
+"""Correction of full-width scans, compared with OpenCV in one run on one machine, on torch's default threads.
 
 Colour and height of a surface in motion are resampled by ``sample_images`` and, with the same maps, by a bare
-``cv2.remap``; both in strips, from one scan to product rows. The correction that makes those maps is timed too, and so
-is a copy of as many bytes as colour and height hold. Memory is that of a process of its own for each length.
+``cv2.remap``, both in strips from one scan to product rows. The correction that makes the maps is timed as well, and
+so is a copy of the bytes of colour and height. A new process for each length of scan measures the memory.
 """
 
 import json
@@ -43,7 +43,7 @@ MATCHING = DisparityConfig(largest_sigma_px=0.2)
 
 @dataclass(frozen=True)
 class Repeated:
-    """A tall image that shows the same lines again and again, made where it is read."""
+    """A tall image that repeats the same lines, without storing more than them."""
 
     lines: Tensor
     height: int
@@ -61,7 +61,7 @@ class Repeated:
 
 
 def surface_scan(lines: int) -> Scan:
-    """A wavy sheet with a raised block and missing depths: as a camera with a matcher of its own delivers it."""
+    """A wavy sheet with a raised block and missing depths, as from a camera that computes depth maps."""
     generator = torch.Generator().manual_seed(0)
     u, v = torch.arange(RIG.width_px), torch.arange(1024)[:, None]
     noise = torch.randn(1024, RIG.width_px, generator=generator)
@@ -100,7 +100,7 @@ def run() -> dict[str, object]:
 
 
 def resampling_speeds() -> tuple[dict[str, float], dict[str, float], dict[str, float]]:
-    """Ours by interpolation and library, bare ``cv2.remap`` by interpolation, and the largest differences of both."""
+    """Mpx/s of ours by interpolation and library, Mpx/s of bare ``cv2.remap``, and the largest differences."""
     scan = surface_scan(2048)
     grid = plan_product(scan, MOTION, CONFIG)
     strip = Correction(scan, depth_of(scan), MOTION, CONFIG, grid).strip((768, 768 + STRIP))
@@ -108,7 +108,7 @@ def resampling_speeds() -> tuple[dict[str, float], dict[str, float], dict[str, f
     start = int(source[..., 0].nan_to_num(nan=1e9).min()) - 4
     stop = int(source[..., 0].nan_to_num(nan=0.0).max()) + 5
     line, column = source[..., 0] - start, source[..., 1].contiguous()
-    filled = [values.nan_to_num(nan=8.0).numpy() for values in (column, line)]  # the peer knows no holes
+    filled = [values.nan_to_num(nan=8.0).numpy() for values in (column, line)]  # cv2.remap cannot skip missing cells
     color = scan.left.read(start, stop)
     height = (RIG.zero_disparity_mm - scan.images.depth.read(start, stop)).nan_to_num(nan=0.0)
 
@@ -156,7 +156,7 @@ def depth_map_speed() -> float:
 
 
 def stereo_scan(lines: int) -> Scan:
-    """A textured plane in two views, as long as it is wanted."""
+    """A textured plane in two views, of any length."""
     generator = torch.Generator().manual_seed(0)
     texture = torch.randint(0, 256, (1024, RIG.width_px + 200, 3), dtype=torch.uint8, generator=generator)
     texture = torch.from_numpy(cv2.GaussianBlur(texture.numpy(), (0, 0), 1.5))
@@ -167,7 +167,7 @@ def stereo_scan(lines: int) -> Scan:
 def scan_speeds() -> dict[str, float]:
     """Mpx/s of correcting a stereo scan, matching included, and of OpenCV alone: SGBM over the same range and a remap.
 
-    OpenCV's SGBM has two ways through the costs in one pass: five directions on one thread, or three on all.
+    OpenCV's SGBM aggregates the costs of one pass in five directions on one thread, or in three on all threads.
     """
     scan = stereo_scan(STEREO_LINES)
     grid = plan_product(scan, MOTION, CONFIG)
@@ -198,7 +198,7 @@ def scan_speeds() -> dict[str, float]:
 
 
 def memcpy_speed() -> float:
-    """Mpx/s of copying colour and height, seven bytes a pixel."""
+    """Mpx/s of copying colour and height, seven bytes per pixel."""
     source = torch.zeros(7 * STRIP * RIG.width_px, dtype=torch.uint8)
     target = torch.empty_like(source)
     seconds = median_seconds({"copy": lambda: target.copy_(source)})["copy"]
@@ -206,7 +206,7 @@ def memcpy_speed() -> float:
 
 
 def median_seconds(sides: dict[str, Callable[[], object]], turns: int = TURNS) -> dict[str, float]:
-    """Median time of each side; the sides take turns, so that a slow moment of the machine meets all of them."""
+    """Median seconds of each side; the sides take turns, so that a slow moment of the machine affects all of them."""
     taken: dict[str, list[float]] = {name: [] for name in sides}
     for turn in range(turns + 1):
         for name, side in sides.items():
@@ -218,7 +218,7 @@ def median_seconds(sides: dict[str, Callable[[], object]], turns: int = TURNS) -
 
 
 def peak_megabytes(lines: int, kind: str = "depth") -> int:
-    """Peak memory of a process that corrects a scan of a number of lines, with a depth map or stereo."""
+    """Peak memory, MB, of a process that corrects a scan of the given length, with a depth map or stereo."""
     code = f"import resampling; resampling.correct_and_report({lines}, {kind!r})"
     folder = str(Path(__file__).parent)
     result = subprocess.run([sys.executable, "-c", code], cwd=folder, capture_output=True, text=True, check=True)
@@ -226,11 +226,11 @@ def peak_megabytes(lines: int, kind: str = "depth") -> int:
 
 
 def correct_and_report(lines: int, kind: str) -> None:
-    """Correct a scan and print the megabytes that it took."""
+    """Correct a scan and print the peak memory of the process, MB."""
     keep_freed_memory()
     scan = stereo_scan(lines) if kind == "stereo" else surface_scan(lines)
     for _ in correct_scan(scan, depth_of(scan, MATCHING), MOTION, CONFIG):
         pass
-    # Not getrusage: its maximum begins with that of the process that started this one.
+    # Not getrusage: its maximum includes that of the parent process.
     status = dict(line.split(":", 1) for line in Path("/proc/self/status").read_text().splitlines())
     print(int(status["VmHWM"].split()[0]) // 1024)
