@@ -1,4 +1,4 @@
-"""A mixed archive through the commands: are products bit-equal for all engines, workers and strips? How fast is a rerun?
+"""A mixed archive through the commands: are all products bit-equal on any engine, workers and strips? And a rerun?
 
 The archive has 200 small scans, half of them with a depth map, and one of 131 072 lines of 1786 px, all of repeated
 random texture. The benchmark takes some minutes and 20 GB of disk.

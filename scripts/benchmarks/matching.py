@@ -7,6 +7,7 @@ error is that of the others.
 
 import math
 import time
+from dataclasses import dataclass
 
 import cv2
 import torch
@@ -29,6 +30,15 @@ SCENES = {
 }
 
 
+@dataclass(frozen=True)
+class Pair:
+    """Images ``(lines, width, 3)`` of both cameras and the true disparity ``(lines, width)`` of the left one, px."""
+
+    left: Tensor
+    right: Tensor
+    disparity: Tensor
+
+
 def run() -> dict[str, object]:
     """Throughput and errors of both on each scene; ``ratio`` is that of the rail in the best turn of each."""
     torch.set_num_threads(1)
@@ -39,16 +49,16 @@ def run() -> dict[str, object]:
 
 
 def _compare(scene: SceneConfig) -> dict[str, object]:
-    left, right, truth = _rendered(scene)
+    pair = _rendered(scene)
     seconds = {"lsvision": math.inf, "opencv": math.inf}
     figures: dict[str, object] = {}
     for _ in range(TURNS):
         for name, matched in (("lsvision", _ours), ("opencv", _peer)):
             begin = time.perf_counter()
-            match = matched(left, right)
+            match = matched(pair.left, pair.right)
             seconds[name] = min(seconds[name], time.perf_counter() - begin)
-            figures[name] = _errors(match, truth)
-    megapixels = truth.numel() / 1e6
+            figures[name] = _errors(match, pair.disparity)
+    megapixels = pair.disparity.numel() / 1e6
     throughput = {name: round(megapixels / value, 2) for name, value in seconds.items()}
     return {"ratio": round(seconds["opencv"] / seconds["lsvision"], 2), "megapixels_per_second": throughput} | figures
 
@@ -69,14 +79,15 @@ def _peer(left: Tensor, right: Tensor) -> StripMatch:
     return StripMatch(disparity, torch.full_like(disparity, torch.nan))
 
 
-def _rendered(scene: SceneConfig) -> tuple[Tensor, Tensor, Tensor]:
+def _rendered(scene: SceneConfig) -> Pair:
+    """A rendered pair of a scene in motion."""
     motion = MotionConfig(angle_x_deg=-1.5, angle_z_deg=0.8, stretch=1.0246)
     sensor = SensorConfig(noise=2.0, supersampling=2)
     source = simulate(RIG, Board(12, 9, 30.0), scene, motion, sensor, Acquisition(0.07, lines=LINES))
     left, right = (torch.cat(list(source.strips(camera))) for camera in ("left", "right"))
     depth = torch.cat(list(source.depth_strips())).double()
     left_px, right_px = project(RIG, torch.zeros_like(depth), depth)
-    return left, right, (left_px - right_px).float()
+    return Pair(left, right, (left_px - right_px).float())
 
 
 def _errors(match: StripMatch, truth: Tensor) -> dict[str, float]:

@@ -60,6 +60,15 @@ class Repeated:
         return self.lines[torch.arange(start, stop) % len(self.lines)]
 
 
+@dataclass(frozen=True)
+class ResamplingSpeeds:
+    """Mpx/s of ours by interpolation and library and of a bare remap by interpolation; largest differences by unit."""
+
+    ours: dict[str, float]
+    remap: dict[str, float]
+    largest_difference: dict[str, float]
+
+
 def surface_scan(lines: int) -> Scan:
     """A wavy sheet with a raised block and missing depths, as from a camera that computes depth maps."""
     generator = torch.Generator().manual_seed(0)
@@ -75,17 +84,17 @@ def surface_scan(lines: int) -> Scan:
 def run() -> dict[str, object]:
     """Mpx/s of both, their ratios, and megabytes at three lengths; ``ratio`` is that of bicubic colour and height."""
     keep_freed_memory()
-    ours, bare, largest = resampling_speeds()
-    ratios = {name: round(ours[name] / bare[name.split()[0]], 2) for name in ours}
+    speeds = resampling_speeds()
+    ratios = {name: round(speed / speeds.remap[name.split()[0]], 2) for name, speed in speeds.ours.items()}
     stereo = scan_speeds()
     return {
         "unit": "Mpx/s of the product",
-        "resampling": {name: round(value, 1) for name, value in ours.items()},
-        "cv2.remap": {name: round(value, 1) for name, value in bare.items()},
+        "resampling": {name: round(value, 1) for name, value in speeds.ours.items()},
+        "cv2.remap": {name: round(value, 1) for name, value in speeds.remap.items()},
         "memcpy": round(memcpy_speed(), 1),
         "ratios": ratios,
         "ratio": ratios["bicubic grid_sample"],
-        "largest_difference": largest,
+        "largest_difference": speeds.largest_difference,
         "correction_of_a_depth_map_scan": round(depth_map_speed(), 2),
         "correction_of_a_stereo_scan": {name: round(value, 2) for name, value in stereo.items()},
         "stereo_ratios": {
@@ -99,8 +108,8 @@ def run() -> dict[str, object]:
     }
 
 
-def resampling_speeds() -> tuple[dict[str, float], dict[str, float], dict[str, float]]:
-    """Mpx/s of ours by interpolation and library, Mpx/s of bare ``cv2.remap``, and the largest differences."""
+def resampling_speeds() -> ResamplingSpeeds:
+    """Sample a strip by ``sample_images`` and by a bare ``cv2.remap`` with the same maps."""
     scan = surface_scan(2048)
     grid = plan_product(scan, MOTION, CONFIG)
     strip = Correction(scan, depth_of(scan), MOTION, CONFIG, grid).strip((768, 768 + STRIP))
@@ -142,7 +151,11 @@ def resampling_speeds() -> tuple[dict[str, float], dict[str, float], dict[str, f
         "grey values": float((found[0].int() - expected[0].int())[known].abs().max()),
         "mm": float((found[1] - expected[1])[known].abs().max()),
     }
-    return {name: speeds[name] for name in speeds if " " in name}, {mode: speeds[mode] for mode in modes}, largest
+    return ResamplingSpeeds(
+        ours={name: speeds[name] for name in speeds if " " in name},
+        remap={mode: speeds[mode] for mode in modes},
+        largest_difference=largest,
+    )
 
 
 def depth_map_speed() -> float:

@@ -1,4 +1,4 @@
-"""A small rig and what most scans share."""
+"""Rigs, a board, a motion and a sensor for most scans."""
 
 import pytest
 import torch

@@ -1,4 +1,4 @@
-"""Rendered corners lie where the model says, here and in another program's images."""
+"""Rendered corners lie where the model predicts, in our images and in another program's."""
 
 import dataclasses
 import json
@@ -65,7 +65,7 @@ def test_corners_are_exact_under_vibration_and_uneven_lines(small_rig, board, cl
     )
     still = simulate(small_rig, board, scene, SHARED_N, clean, Acquisition(0.56))
     moved = (simulation.corners()[0] - still.corners()[0]).abs().amax(0)
-    assert (moved > 0.5).all()  # px and lines: there is something to be exact about
+    assert (moved > 0.5).all()  # px and lines: large enough to matter
     assert _worst(simulation, whole, board) < 0.01
 
 
@@ -80,7 +80,7 @@ def test_corners_of_another_renderer_lie_where_the_model_predicts(shared_data, b
     torch.testing.assert_close(simulation.trajectory.n.tolist(), truth["n"])
     for camera, predicted in zip(("left", "right"), simulation.corners(), strict=True):
         theirs = torch.from_numpy(cv2.imread(str(folder / f"{camera}.tif"))).double().mean(-1)
-        # Their edges are hard and sampled at thirds of a pixel; a blur makes a fit of their place well posed.
+        # Its edges are hard and sampled at thirds of a pixel; blurred edges can be located by a fit.
         soft = torch.from_numpy(cv2.GaussianBlur(theirs.numpy(), (9, 9), 1.0))
         error = fit_corners(soft, predicted, board.inner) - predicted
         assert error.square().mean().sqrt() < 0.05  # px

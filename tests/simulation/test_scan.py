@@ -78,7 +78,7 @@ def test_reverse_transport_turns_the_image_upside_down(coarse, board, clean, mot
     scene = dataclasses.replace(scene, conveyor_drop_mm=40.0)
     forward = simulate(coarse, board, scene, motion, clean, Acquisition(PITCH))
     reverse = simulate(coarse, board, scene, motion, clean, Acquisition(PITCH, transport="reverse"))
-    # Inside the target: the conveyor, which has no place of its own, shows other parts of its texture.
+    # Inside the target: the endless conveyor shows other parts of its texture.
     covered = torch.cat(list(forward.depth_strips())) < coarse.zero_disparity_mm + scene.conveyor_drop_mm - 3.0
     inside = -torch.nn.functional.max_pool2d(-covered[None].float(), 9, 1, 4)[0] > 0
     assert inside.sum() > 30_000
@@ -125,7 +125,7 @@ def test_rail_depth_is_its_profile_along_the_motion(coarse, board, clean):
 
 
 def _color_shifts(simulation, whole, board):
-    """How far, in columns and lines, each colour's corners lie from the model of the middle colour; (3, corners, 2)."""
+    """Shift, in columns and lines, of each colour's corners from the model of the middle one; (3, corners, 2)."""
     image, truth = whole(simulation), simulation.corners()[0]
     spacing = simulation.rig.color_spacing_lines
     late = 0.0 if simulation.sensor.color_registered else -simulation.trajectory.sign
@@ -142,7 +142,7 @@ def test_colours_lie_where_their_sensor_lines_look(small_rig, board, clean, whol
     scene, motion = SceneConfig(board_texture=0.0), MotionConfig(stretch=stretch)
     simulation = simulate(rig, board, scene, motion, sensor, Acquisition(0.56, transport=transport))
     shift = _color_shifts(simulation, whole, board)
-    # Colour s sees a point when it is still s / stretch lines short of the plane Y = 0; the camera puts back s lines.
+    # Colour s sees a point when it is still s / stretch lines short of the plane Y = 0; the camera shifts by s lines.
     per_line = simulation.trajectory.sign * (registered - 1.0 / stretch)
     expected = torch.zeros_like(shift)
     expected[..., 1] = per_line * torch.tensor(rig.color_spacing_lines)[:, None]

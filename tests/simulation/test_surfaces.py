@@ -102,11 +102,11 @@ def test_integration_keeps_light_and_has_the_variance_of_box_and_blur(blur_px):
     torch.testing.assert_close(flat, torch.full((3, 15, 15), 0.7))
     samples = torch.zeros(1, count * 5, count * 5)
     samples[0, (count // 2) * 5 + 2, (count // 2) * 5 + 2] = 1.0
-    spread = integrate(samples, sensor)[0]
-    profile = spread.sum(0) / spread.sum()
+    blurred = integrate(samples, sensor)[0]
+    profile = blurred.sum(0) / blurred.sum()
     shift = torch.arange(15.0) - 7
     torch.testing.assert_close((profile * shift).sum(), torch.tensor(0.0), rtol=0, atol=1e-5)
-    # Summed over pixels a centred point spreads by the blur alone, up to what sampling at pixels adds to a box.
+    # Summed over pixels, the variance of a centred point is that of the blur, plus what the sampling of a box adds.
     assert (profile * shift**2).sum() == pytest.approx(blur_px**2 + (blur_px > 0) / 12, abs=0.1)
 
 

@@ -63,7 +63,7 @@ def test_rays_pass_through_the_points_that_project_onto_them(trajectory, small_r
 
 
 def test_displacement_adds_to_what_the_cameras_see(small_rig):
-    """A point on the axis of roll is seen where it would be, moved by (dx, dz)."""
+    """A point on the axis of roll is seen shifted by (dx, dz)."""
     trajectory = Trajectory(small_rig, SHAKEN, EncoderConfig(), 0.56)
     y = torch.tensor([80.0], dtype=torch.float64)
     x, line, z = trajectory.project(trajectory.pivot + y[:, None] * trajectory.n).unbind(-1)
