@@ -30,7 +30,7 @@ def place(rig: Rig, board: Board, scene: SceneConfig, n: Tensor, middle_mm: floa
 
 
 def scene_lines(board: Board, scene: SceneConfig, n: Tensor, line_pitch_mm: float) -> int:
-    """Lines of a scan that shows the whole target and its margin, or the length of rail asked for."""
+    """Lines of a scan that shows the whole target and its margin, or the length ``rail_length_mm`` of a rail."""
     if scene.kind == "rail":
         return math.ceil(scene.rail_length_mm / line_pitch_mm)
     rotation = _turn(scene.pitch_deg, scene.roll_deg, scene.yaw_deg)
