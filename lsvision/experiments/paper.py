@@ -13,7 +13,7 @@ from lsvision.experiments.correct import write_product
 from lsvision.experiments.parallel import map_names, scan_pool
 from lsvision.experiments.settings import RunSettings
 from lsvision.experiments.simulate import write_simulation
-from lsvision.geometry import displace
+from lsvision.geometry import displace, scaled_rig
 from lsvision.io import Product, read_product, read_scan, write_calibration, write_text
 from lsvision.report.paper_pages import write_paper_report
 from lsvision.report.paper_scenario import PAPER, BoardCheck, Scenario
@@ -25,7 +25,6 @@ from lsvision.simulation import (
     SceneConfig,
     SensorConfig,
     Simulation,
-    scaled_rig,
     simulate,
 )
 from lsvision.simulation.sheet_points import points_in_product, points_in_scan

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from lsvision.errors import ConfigError
 from lsvision.experiments.settings import RunSettings
+from lsvision.geometry import scaled_rig
 from lsvision.io import write_scan
 from lsvision.report.progress import ProgressBars, progress_bars
 from lsvision.simulation import (
@@ -19,7 +20,6 @@ from lsvision.simulation import (
     SceneConfig,
     SensorConfig,
     Simulation,
-    scaled_rig,
     simulate,
 )
 from lsvision.types import Board, Rig, Transport

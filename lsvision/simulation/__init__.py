@@ -2,7 +2,7 @@
 
 from lsvision.simulation.artwork import artwork
 from lsvision.simulation.config import BoardPose, EncoderConfig, MotionConfig, SceneConfig, SensorConfig
-from lsvision.simulation.scan import Acquisition, Simulation, scaled_rig, simulate
+from lsvision.simulation.scan import Acquisition, Simulation, simulate
 from lsvision.simulation.trajectory import Trajectory
 
 __all__ = [
@@ -15,6 +15,5 @@ __all__ = [
     "Simulation",
     "Trajectory",
     "artwork",
-    "scaled_rig",
     "simulate",
 ]

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from lsvision.geometry import middle_point
 from lsvision.types import Rig
 
 # Distance of each light from the middle of the field along X, and above the plane of zero disparity.
@@ -40,8 +41,8 @@ class Lighting:
 
 def line_lights(rig: Rig) -> Lighting:
     """The lights above a rig's plane of zero disparity."""
-    middle = rig.baseline_mm / 2
-    return Lighting(middle - _ASIDE_MM, middle + _ASIDE_MM, rig.zero_disparity_mm - _ABOVE_MM)
+    middle_x, _, z0 = middle_point(rig).tolist()
+    return Lighting(middle_x - _ASIDE_MM, middle_x + _ASIDE_MM, z0 - _ABOVE_MM)
 
 
 def _facing(aside: Tensor, up_part: Tensor, up_squared: Tensor, normal_x: Tensor | float) -> Tensor:

@@ -1,17 +1,16 @@
 """Simulated line-scan stereo scans, rendered strip by strip."""
 
 import dataclasses
-import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from lsvision.errors import ConfigError
-from lsvision.geometry import project
+from lsvision.geometry import Camera, project
 from lsvision.simulation.config import EncoderConfig, MotionConfig, SceneConfig, SensorConfig
 from lsvision.simulation.noise import lattice_hash
 from lsvision.simulation.scene import build_scene, place, scene_lines
@@ -19,8 +18,6 @@ from lsvision.simulation.sensor import expose, halo_px, integrate, sample_offset
 from lsvision.simulation.surfaces import Look, Scene
 from lsvision.simulation.trajectory import Trajectory, cast_rays
 from lsvision.types import Board, Pose, Rig, Transport, Travel
-
-Camera = Literal["left", "right"]
 
 # Lines rendered at once. Blocks begin at multiples of it, so that strips of every height have the same bits; 32 lines
 # of samples fit the processor's cache.
@@ -178,24 +175,6 @@ def simulate(
     middle_mm = trajectory.sign * pitch * (lines - 1) / 2
     pose = place(rig, board, scene, trajectory.n, middle_mm)
     return Simulation(rig, board, scene, sensor, trajectory, _logged_travel(trajectory, lines), lines, pose)
-
-
-def scaled_rig(rig: Rig, scale: float) -> Rig:
-    """The same cameras with ``scale`` times larger pixels, over the same field; the line pitch should grow as much.
-
-    Source: the edge of the first pixel stays where it is, so a column c becomes (c + 0.5) / scale - 0.5.
-    """
-    if scale < 1:
-        raise ValueError(f"scale must be at least 1, got {scale}")
-    red, green, blue = rig.color_spacing_lines
-    return dataclasses.replace(
-        rig,
-        width_px=math.ceil(rig.width_px / scale),
-        pixel_pitch_um=rig.pixel_pitch_um * scale,
-        principal_left_px=(rig.principal_left_px + 0.5) / scale - 0.5,
-        principal_right_px=(rig.principal_right_px + 0.5) / scale - 0.5,
-        color_spacing_lines=(red / scale, green / scale, blue / scale),
-    )
 
 
 def _logged_travel(trajectory: Trajectory, lines: int) -> Travel:

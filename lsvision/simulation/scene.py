@@ -5,7 +5,7 @@ import math
 import torch
 from torch import Tensor
 
-from lsvision.geometry import product_axes, rotation_from_vector
+from lsvision.geometry import aligned_rotation, middle_point, rotation_from_vector
 from lsvision.simulation.config import SceneConfig
 from lsvision.simulation.lighting import line_lights
 from lsvision.simulation.rail import RailScene
@@ -18,10 +18,9 @@ def place(rig: Rig, board: Board, scene: SceneConfig, n: Tensor, middle_mm: floa
 
     Y of a rail's frame runs along the motion n; roll turns the rail about it.
     """
-    depth = rig.zero_disparity_mm + scene.depth_offset_mm
-    middle = n.new_tensor([rig.baseline_mm / 2, 0.0, depth]) + middle_mm * n
+    middle = middle_point(rig) + n.new_tensor([0.0, 0.0, scene.depth_offset_mm]) + middle_mm * n
     if scene.kind == "rail":
-        rotation = product_axes(n).mT @ _turn(0.0, scene.roll_deg, 0.0)
+        rotation = aligned_rotation(n) @ _turn(0.0, scene.roll_deg, 0.0)
         return Pose(rotation, middle - n.new_tensor([0.0, 0.0, scene.rail_rise_mm]))
     rotation = _turn(scene.pitch_deg, scene.roll_deg, scene.yaw_deg)
     outline = _outline(board, scene)
@@ -41,8 +40,8 @@ def scene_lines(board: Board, scene: SceneConfig, n: Tensor, line_pitch_mm: floa
 def build_scene(rig: Rig, board: Board, scene: SceneConfig, pose: Pose, n: Tensor) -> Scene:
     """Target, conveyor and lights; conveyor and rail run along the motion n."""
     lighting = line_lights(rig)
-    ground = n.new_tensor([rig.baseline_mm / 2, 0.0, rig.zero_disparity_mm + scene.conveyor_drop_mm])
-    conveyor = Conveyor(Pose(product_axes(n).mT, ground), lighting, scene.texture_mm, scene.seed)
+    ground = middle_point(rig) + n.new_tensor([0.0, 0.0, scene.conveyor_drop_mm])
+    conveyor = Conveyor(Pose(aligned_rotation(n), ground), lighting, scene.texture_mm, scene.seed)
     if scene.kind == "board":
         return BoardScene(board, scene, pose, lighting, conveyor)
     if scene.kind == "sheet":

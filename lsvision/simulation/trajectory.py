@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from lsvision.geometry import Camera, camera_center_mm, middle_point, slope_at
 from lsvision.simulation.config import EncoderConfig, MotionConfig
 from lsvision.simulation.noise import lattice_hash
 from lsvision.types import Pose, Rig, Transport
@@ -48,7 +49,7 @@ class Trajectory:
     @property
     def pivot(self) -> Tensor:
         """Point c on the axis of roll, mm, float64 (3,)."""
-        return torch.tensor([self.rig.baseline_mm / 2, 0.0, self.rig.zero_disparity_mm], dtype=torch.float64)
+        return middle_point(self.rig)
 
     def position(self, line: Tensor) -> Tensor:
         """True nominal travel y, mm, of (fractional) lines, float64."""
@@ -132,7 +133,7 @@ class Rays:
         return (self.slope[None] + self.middle_slope).mul(z).add_(self.camera_x_mm)
 
 
-def cast_rays(trajectory: Trajectory, camera: str, columns: Tensor, lines: Tensor, plane_y_mm: float = 0.0) -> Rays:
+def cast_rays(trajectory: Trajectory, camera: Camera, columns: Tensor, lines: Tensor, plane_y_mm: float = 0.0) -> Rays:
     """Rays of the left or right camera through columns ``(w,)`` px on (fractional) lines ``(h,)``, float64.
 
     Args:
@@ -142,11 +143,9 @@ def cast_rays(trajectory: Trajectory, camera: str, columns: Tensor, lines: Tenso
         plane_y_mm: Y of the plane that the sensor line sees; zero except for a trilinear sensor.
     """
     rig = trajectory.rig
-    left = camera == "left"
-    principal = rig.principal_left_px if left else rig.principal_right_px
-    camera_x = 0.0 if left else rig.baseline_mm
-    middle_slope = ((rig.width_px - 1) / 2 - principal) / rig.focal_length_px
-    slope = (columns.double() - principal) / rig.focal_length_px - middle_slope
+    camera_x = camera_center_mm(rig, camera)
+    middle_slope = slope_at(rig, (rig.width_px - 1) / 2, camera)
+    slope = slope_at(rig, columns.double(), camera) - middle_slope
     dx, dz, roll = trajectory.vibration(lines).unbind(-1)
     cos, sin, zero = torch.cos(roll), torch.sin(roll), torch.zeros_like(roll)
     across = torch.stack([cos, zero, sin], -1)  # columns of the inverse of Rroll

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import torch
 
+from lsvision.geometry import zero_disparity_mm
 from lsvision.io import read_product, write_calibration, write_scan
 from lsvision.types import Calibration, Motion, Observability, Rig, Travel
 
@@ -61,7 +62,7 @@ def _make_archive(root: Path) -> Path:
     texture = torch.nn.functional.avg_pool2d(noise, 3, 1, 1)[:, 0].movedim(0, -1)
     left = ((texture - 0.5) * 400 + 128).clamp(0, 255).to(torch.uint8)
     right = left.roll(-SHIFT_PX, 1)
-    depth = torch.full((SMALL_LINES, RIG.width_px, 1), RIG.zero_disparity_mm - 1.0)
+    depth = torch.full((SMALL_LINES, RIG.width_px, 1), zero_disparity_mm(RIG) - 1.0)
     for number in range(SMALL):
         lines = slice(number * 16, number * 16 + SMALL_LINES)
         stereo = number % 2 == 1

@@ -19,6 +19,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from lsvision.geometry import zero_disparity_mm
 from lsvision.image.brightness import gray_bytes
 from lsvision.image.resampling import SAMPLED_TILES, Interpolation, Resampler, sample_images
 from lsvision.image.tiling import in_parallel, keep_freed_memory, tiles
@@ -119,7 +120,7 @@ def resampling_speeds() -> ResamplingSpeeds:
     line, column = source[..., 0] - start, source[..., 1].contiguous()
     filled = [values.nan_to_num(nan=8.0).numpy() for values in (column, line)]  # cv2.remap cannot skip missing cells
     color = scan.left.read(start, stop)
-    height = (RIG.zero_disparity_mm - scan.images.depth.read(start, stop)).nan_to_num(nan=0.0)
+    height = (zero_disparity_mm(RIG) - scan.images.depth.read(start, stop)).nan_to_num(nan=0.0)
 
     def ours(mode: Interpolation, resampler: Resampler) -> tuple[Tensor, Tensor]:
         made = torch.empty(*line.shape, 3, dtype=torch.uint8), torch.empty(*line.shape, 1)

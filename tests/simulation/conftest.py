@@ -3,7 +3,8 @@
 import pytest
 import torch
 
-from lsvision.simulation import MotionConfig, SensorConfig, scaled_rig
+from lsvision.geometry import scaled_rig
+from lsvision.simulation import MotionConfig, SensorConfig
 from lsvision.types import Board, Rig
 
 

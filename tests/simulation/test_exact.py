@@ -7,13 +7,13 @@ import cv2
 import pytest
 import torch
 
+from lsvision.geometry import scaled_rig
 from lsvision.simulation import (
     Acquisition,
     EncoderConfig,
     MotionConfig,
     SceneConfig,
     SensorConfig,
-    scaled_rig,
     simulate,
 )
 from lsvision.types import Pose, Rig

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from lsvision.errors import ConfigError
-from lsvision.geometry import line_at, travel_at, triangulate
+from lsvision.geometry import line_at, scaled_rig, travel_at, triangulate
 from lsvision.simulation import (
     Acquisition,
     EncoderConfig,
@@ -15,7 +15,6 @@ from lsvision.simulation import (
     SceneConfig,
     SensorConfig,
     artwork,
-    scaled_rig,
     simulate,
 )
 from lsvision.types import Rig
@@ -221,18 +220,6 @@ def test_mono_and_16_bits(coarse, board, motion, whole):
     assert (whole(mono)[..., 0] - color.mean(-1)).abs().max() <= 1.0
     assert next(deep.strips("left")).dtype == torch.uint16
     assert (whole(deep) / 257 - color).abs().max() <= 0.51
-
-
-def test_scaled_rig_keeps_the_field_and_its_edge(full_rig):
-    rig = scaled_rig(full_rig, 4)
-    assert rig.width_px == 1786
-    torch.testing.assert_close(
-        [rig.pixel_pitch_um, rig.principal_left_px, rig.principal_right_px, rig.zero_disparity_mm],
-        [40.0, 260.125, 1524.375, full_rig.zero_disparity_mm],
-    )
-    assert scaled_rig(full_rig, 1) == full_rig
-    with pytest.raises(ValueError, match="scale"):
-        scaled_rig(full_rig, 0.5)
 
 
 @pytest.mark.parametrize(

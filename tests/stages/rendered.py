@@ -5,7 +5,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from lsvision.geometry import scan_position, transform
+from lsvision.geometry import scaled_rig, scan_position, transform
 from lsvision.simulation import (
     Acquisition,
     EncoderConfig,
@@ -13,7 +13,6 @@ from lsvision.simulation import (
     SceneConfig,
     SensorConfig,
     Simulation,
-    scaled_rig,
     simulate,
 )
 from lsvision.types import Board, DepthView, Rig, Scan, StereoPair, TensorImage, Transport

@@ -9,14 +9,13 @@ import torch
 import torch.nn.functional as F  # noqa: N812
 from torch import Tensor
 
-from lsvision.geometry import ProductFrame
+from lsvision.geometry import ProductFrame, scaled_rig
 from lsvision.simulation import (
     Acquisition,
     EncoderConfig,
     MotionConfig,
     SceneConfig,
     SensorConfig,
-    scaled_rig,
     simulate,
 )
 from lsvision.stages.correction.config import CorrectionConfig
