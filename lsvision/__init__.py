@@ -1,3 +1,3 @@
 """Calibration and correction of the motion distortion of binocular line-scan stereo cameras."""
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"

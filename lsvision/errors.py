@@ -1,21 +1,21 @@
-"""Errors whose cause is the data or the files, not the caller's code."""
+"""Errors whose cause is the data, a file or an option, not the caller's code."""
 
 from pathlib import Path
 
 
 class LsvisionError(Exception):
-    """Base of the errors that a command reports in one line before it exits with their code."""
+    """Base of the errors that a command reports in one line; ``exit_code`` is the command's."""
 
     exit_code = 1
 
 
 class FileFormatError(LsvisionError):
-    """A file that cannot be read as what it claims to be.
+    """A file that is missing or not of the expected format.
 
     Args:
         path: the file at fault.
-        problem: what was expected and what came, in words.
-        key: the entry within the file, where there is one ("principal_point_px.left").
+        problem: what was expected and what was found, in words.
+        key: the entry within the file, if it has entries ("principal_point_px.left").
     """
 
     def __init__(self, path: Path | str, problem: str, key: str | None = None) -> None:
@@ -28,24 +28,24 @@ class FileFormatError(LsvisionError):
 
 
 class WriteError(LsvisionError):
-    """A file that cannot be written, as on a full disk; names the file."""
+    """A file that cannot be written, as on a full disk; the message names it."""
 
 
 class BoardNotFoundError(LsvisionError):
-    """A scan in which the calibration board was looked for and not found."""
+    """A scan that does not show the calibration board."""
 
 
 class CalibrationError(LsvisionError):
-    """A calibration that cannot be computed or does not fit the scan it is applied to."""
+    """A calibration that cannot be computed, or does not fit the scan that it should correct."""
 
 
 class ConfigError(LsvisionError):
-    """An option whose value makes no sense; names the option."""
+    """An option with an impossible value; the message names the option."""
 
 
 class ScansFailedError(LsvisionError):
-    """A run over many scans of which some failed; the exit code is their number, up to 100."""
+    """A run over many scans, some of which failed; the exit code is their number, up to 100."""
 
     def __init__(self, failed: int, scans: int, where: str) -> None:
-        super().__init__(f"{failed} of {scans} scans failed; {where} says why")
+        super().__init__(f"{failed} of {scans} scans failed; {where} gives the reasons")
         self.exit_code = min(failed, 100)

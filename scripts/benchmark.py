@@ -1,7 +1,7 @@
-"""Speed against the peer library, in one run on one machine: ``python scripts/benchmark.py NAME [--json]``.
+"""Speed compared with a peer library, in one run on one machine: ``python scripts/benchmark.py NAME [--json]``.
 
-Every NAME is a file of ``scripts/benchmarks`` with a function ``run`` that returns the figures of both, and ``ratio``:
-ours over the peer's throughput.
+Every NAME is a file of ``scripts/benchmarks`` with a function ``run``, which returns the figures of both libraries and
+``ratio``, our throughput over the peer's.
 """
 
 import argparse
@@ -18,7 +18,7 @@ FOLDER = Path(__file__).parent / "benchmarks"
 
 
 def machine() -> dict[str, str | int]:
-    """What the figures were measured on."""
+    """Processor, cores and versions, with which the figures change."""
     return {
         "processor": platform.processor() or platform.machine(),
         "cpu": torch.backends.cpu.get_cpu_capability(),

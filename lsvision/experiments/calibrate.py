@@ -1,4 +1,4 @@
-"""``+experiment=calibrate``: boards' scans -> corners -> calibration.json and a report."""
+"""``+experiment=calibrate``: scans of boards -> corners -> ``calibration.json`` and a report."""
 
 import json
 import logging
@@ -33,7 +33,7 @@ class CalibrateSettings(RunSettings):
 
 
 def run_calibrate(settings: CalibrateSettings, folder: Path) -> None:
-    """Find the board in every scan, calibrate, write the result and its report."""
+    """Find the board in every scan, calibrate, write the calibration and its report."""
     scans = read_scans(settings.scans)
     boards = find_boards(scans, settings.board, settings.corners)
     calibration = calibrate(boards, scans[0].rig, settings.calibration)
@@ -51,7 +51,7 @@ def run_calibrate(settings: CalibrateSettings, folder: Path) -> None:
 
 
 def read_scans(paths: Sequence[str]) -> list[Scan]:
-    """Open scans that were taken with one rig.
+    """Open scans and check that all have the same rig.
 
     Raises:
         ConfigError: the list is empty.
@@ -62,7 +62,7 @@ def read_scans(paths: Sequence[str]) -> list[Scan]:
     scans = [read_scan(path) for path in paths]
     for scan in scans[1:]:
         if scan.rig != scans[0].rig:
-            raise CalibrationError(f"{scan.path}: another rig than {scans[0].path}; calibrate them apart")
+            raise CalibrationError(f"{scan.path}: another rig than that of {scans[0].path}; calibrate each rig alone")
     return scans
 
 
@@ -78,7 +78,7 @@ def find_boards(scans: Sequence[Scan], board: Board, config: CornersConfig) -> l
 
 
 def _summary(calibration: Calibration) -> dict:
-    """The figures by which calibrations are compared; ``calibration.json`` has all."""
+    """The figures by which calibrations are compared; ``calibration.json`` has everything."""
     return {
         "method": calibration.method,
         "boards": len(calibration.boards),

@@ -1,7 +1,7 @@
-"""``+experiment=paper``: Wang et al. 2024 redone on scan files, start to end.
+"""``+experiment=paper``: Wang et al. 2024 redone on scan files, from start to end.
 
 Renders boards, a sheet and a rail, writes them as scan folders, reads them back, calibrates by both methods, corrects
-everything and holds the figures against the paper's; once without vibration and once with.
+all scans and compares the figures with the paper's: once without vibration and once with it.
 """
 
 import json
@@ -10,14 +10,23 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 from lsvision.experiments.correct import write_product
-from lsvision.experiments.parallel import scan_pool
+from lsvision.experiments.parallel import map_names, scan_pool
 from lsvision.experiments.settings import RunSettings
 from lsvision.experiments.simulate import write_simulation
-from lsvision.geometry import displace
+from lsvision.geometry import displace, scaled_rig
 from lsvision.io import Product, read_product, read_scan, write_calibration, write_text
-from lsvision.report.paper_pages import PAPER, BoardCheck, Scenario, write_paper_report
+from lsvision.report.paper_pages import write_paper_report
+from lsvision.report.paper_scenario import PAPER, BoardCheck, Scenario
 from lsvision.report.progress import ProgressBars, progress_bars
-from lsvision.simulation import BoardPose, MotionConfig, SceneConfig, SensorConfig, Simulation, scaled_rig, simulate
+from lsvision.simulation import (
+    Acquisition,
+    BoardPose,
+    MotionConfig,
+    SceneConfig,
+    SensorConfig,
+    Simulation,
+    simulate,
+)
 from lsvision.simulation.sheet_points import points_in_product, points_in_scan
 from lsvision.stages.calibration.calibrate import calibrate
 from lsvision.stages.calibration.config import CalibrationConfig
@@ -55,7 +64,7 @@ class PaperSettings(RunSettings):
 
 
 def run_paper(settings: PaperSettings, folder: Path) -> None:
-    """Both scenarios, then the summary and the report."""
+    """Run both scenarios, then write the summary and the report."""
     scenarios = {}
     with progress_bars() as bars:
         for name, motion in (("still", settings.still), ("vibrating", settings.vibrating)):
@@ -77,28 +86,28 @@ def run_paper(settings: PaperSettings, folder: Path) -> None:
 def _scenario(settings: PaperSettings, motion: MotionConfig, folder: Path, bars: ProgressBars) -> Scenario:
     """Render, read back, calibrate by both methods, correct and measure, for one motion."""
     simulations = _simulations(settings, motion)
-    names = list(simulations)
     with scan_pool(settings.threads) as pool:
-        rendered = pool.map(lambda name: _rendered(simulations[name], folder / name, bars), names)
-        scans = dict(zip(names, rendered, strict=True))
-        boards = {name: scan for name, scan in scans.items() if name.startswith("board")}
-        found = pool.map(lambda scan: find_corners(scan, settings.board, settings.corners), boards.values())
-        corners = dict(zip(boards, found, strict=True))
 
-        rig = scans["sheet"].rig
-        joint = calibrate(list(corners.values()), rig, settings.joint)
-        two_step = calibrate([next(iter(corners.values()))], rig, settings.two_step)
-        for method, calibration in (("joint", joint), ("two_step", two_step)):
-            write_calibration(calibration, folder / f"calibration_{method}.json")
+        def rendered(name: str) -> Scan:
+            write_simulation(simulations[name], folder / name, bars)
+            return read_scan(folder / name)
+
+        scans = map_names(pool, rendered, simulations)
+        boards = [name for name in scans if name.startswith("board")]
+        corners = map_names(pool, lambda name: find_corners(scans[name], settings.board, settings.corners), boards)
+
+        joint = calibrate(list(corners.values()), scans["sheet"].rig, settings.joint)
+        two_step = calibrate([corners[boards[0]]], scans["sheet"].rig, settings.two_step)
+        write_calibration(joint, folder / "calibration_joint.json")
+        write_calibration(two_step, folder / "calibration_two_step.json")
 
         def corrected(name: str) -> Product:
             target = folder / f"{name}.zarr"
             write_product(scans[name], joint.motion, settings.disparity, settings.correction, target, bars)
             return read_product(target)
 
-        products = dict(zip(names, pool.map(corrected, names), strict=True))
-        checked = pool.map(lambda name: _check_board(settings.board, corners[name], products[name]), boards)
-        checks = dict(zip(boards, checked, strict=True))
+        products = map_names(pool, corrected, scans)
+        checks = map_names(pool, lambda name: _check_board(settings.board, corners[name], products[name]), boards)
     sheet = simulations["sheet"]
     color, height, grid = _in_memory(products["sheet"])
     return Scenario(
@@ -113,11 +122,6 @@ def _scenario(settings: PaperSettings, motion: MotionConfig, folder: Path, bars:
     )
 
 
-def _rendered(simulation: Simulation, folder: Path, bars: ProgressBars) -> Scan:
-    write_simulation(simulation, folder, bars)
-    return read_scan(folder)
-
-
 def _simulations(settings: PaperSettings, motion: MotionConfig) -> dict[str, Simulation]:
     """The scans of a scenario by name: board_1, board_2, .., sheet, rail."""
     scenes = {
@@ -126,14 +130,14 @@ def _simulations(settings: PaperSettings, motion: MotionConfig) -> dict[str, Sim
     scenes |= {"sheet": settings.sheet, "rail": settings.rail}
     rig = scaled_rig(settings.rig, settings.scale)
     return {
-        # Each pass meets another phase of the vibration and other noise.
+        # Each scan has another phase of the vibration and other noise.
         name: simulate(
             rig,
             settings.board,
             scene,
             replace(motion, seed=motion.seed + index),
             replace(settings.sensor, seed=settings.sensor.seed + index),
-            settings.line_pitch_mm * settings.scale,
+            Acquisition(settings.line_pitch_mm * settings.scale),
         )
         for index, (name, scene) in enumerate(scenes.items())
     }
@@ -142,14 +146,16 @@ def _simulations(settings: PaperSettings, motion: MotionConfig) -> dict[str, Sim
 def _check_board(board: Board, corners: BoardCorners, product: Product) -> BoardCheck:
     """Distances between a board's corners at nominal motion and in the product."""
     nominal = displace(corners.points, corners.points.new_tensor([0.0, 1.0, 0.0]))
-    before = distance_errors(nominal, board, corners.valid)
+    neighbours_mm, pairs_mm = distance_errors(nominal, board, corners.valid)
     measured = measure_board(*_in_memory(product), board)
     if measured is None:
-        return BoardCheck(0, before, (float("nan"), float("nan")), None)
+        return BoardCheck(0, neighbours_mm, pairs_mm)
     return BoardCheck(
         corners=int(measured.valid.sum()),
-        before_mm=before,
-        after_mm=(measured.neighbour_rms_mm, measured.distance_rms_mm),
+        neighbours_before_mm=neighbours_mm,
+        pairs_before_mm=pairs_mm,
+        neighbours_after_mm=measured.neighbour_rms_mm,
+        pairs_after_mm=measured.distance_rms_mm,
         points=measured.points,
     )
 

@@ -10,15 +10,16 @@ from torch import Tensor
 
 from lsvision.errors import ConfigError
 from lsvision.experiments.settings import RunSettings
+from lsvision.geometry import scaled_rig
 from lsvision.io import write_scan
 from lsvision.report.progress import ProgressBars, progress_bars
 from lsvision.simulation import (
+    Acquisition,
     EncoderConfig,
     MotionConfig,
     SceneConfig,
     SensorConfig,
     Simulation,
-    scaled_rig,
     simulate,
 )
 from lsvision.types import Board, Rig, Transport
@@ -61,10 +62,12 @@ def run_simulate(settings: SimulateSettings, folder: Path) -> None:
         settings.scene,
         settings.motion,
         settings.sensor,
-        settings.line_pitch_mm * settings.scale,
-        lines=settings.lines,
-        transport=settings.transport,
-        encoder=settings.encoder,
+        Acquisition(
+            settings.line_pitch_mm * settings.scale,
+            lines=settings.lines,
+            transport=settings.transport,
+            encoder=settings.encoder,
+        ),
     )
     target = Path(settings.output) if settings.output else folder / "scan"
     with progress_bars() as bars:

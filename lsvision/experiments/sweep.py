@@ -1,7 +1,7 @@
-"""``--multirun``: every job writes down how it ended, and a callback gathers all of them into one table and one report.
+"""``--multirun``: every job records how it ended, and a callback gathers all jobs into one table and one report.
 
-A job that fails does not end the sweep: its reason is kept beside its log, and the sweep's exit code is 1. What each
-job found is read from its folder alone, so that the launcher does not matter (basic, joblib, submitit).
+A job that fails does not end the sweep: its reason is written beside its log, and the sweep's exit code is 1. The
+results of a job are read from its folder alone, so the launcher does not matter (basic, joblib, submitit).
 """
 
 import json
@@ -30,7 +30,7 @@ _RECORD, _SUMMARY = "job.json", "summary.json"
 
 @dataclass(frozen=True, kw_only=True)
 class CollectSettings(RunSettings):
-    """Options of ``+experiment=collect``; ``sweep`` is the folder of a sweep whose submitting process has gone."""
+    """Options of ``+experiment=collect``; ``sweep`` is the folder of a sweep whose submitting process has ended."""
 
     sweep: str
 
@@ -57,7 +57,7 @@ class SweepReport(Callback):
 
 
 def run_job(experiment: Callable[[], None], folder: Path, overrides: Sequence[str]) -> Exception | None:
-    """Run one job of a sweep and write down how it ended; returns what it failed with, so that the others go on."""
+    """Run one job of a sweep and record how it ended; the error of a failed job is returned, so that the others run."""
     begin, failure = time.time(), None
     try:
         experiment()
@@ -73,9 +73,9 @@ def run_job(experiment: Callable[[], None], folder: Path, overrides: Sequence[st
 
 
 def collect_sweep(folder: Path) -> list[SweepJob]:
-    """All jobs of a sweep, written as ``sweep.parquet`` and ``report.html``, and ``points.parquet`` of studies.
+    """Read all jobs of a sweep; write ``sweep.parquet``, ``report.html`` and, for studies, ``points.parquet``.
 
-    A job without a record is one that was killed, or has not ended yet.
+    A job without a record was killed, or has not ended yet.
 
     Raises:
         ConfigError: the folder holds no jobs.
@@ -109,12 +109,11 @@ def _read_job(folder: Path) -> SweepJob:
 
 
 def _row(job: SweepJob) -> dict[str, object]:
-    given = dict(item.lstrip("+~").partition("=")[::2] for item in job.overrides)
-    return {"job": job.name, **given, "seconds": job.seconds, "reason": job.reason, **job.results}
+    return {"job": job.name, **job.options, "seconds": job.seconds, "reason": job.reason, **job.results}
 
 
 def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, float | str | bool]:
-    """Scalars of nested values by dotted names; short lists are numbered from 1, long ones left out."""
+    """Scalars of nested values by dotted names; lists of three or fewer are numbered from 1, longer ones dropped."""
     flat: dict[str, float | str | bool] = {}
     for key, value in values.items():
         if isinstance(value, list) and len(value) <= 3:

@@ -52,7 +52,7 @@ def slope_at(rig: Rig, column_px: Number, camera: Camera = "left") -> Number:
     return (column_px - principal_px) / focal_length_px(rig)
 
 
-def scaled_rig(rig: Rig, scale: float) -> Rig:
+def scaled_rig(rig: Rig, scale: float | int) -> Rig:
     """The same cameras with ``scale`` times larger pixels over the same field; the line pitch should grow as much.
 
     The outer edge of the first pixel stays where it is: a column c becomes (c + 0.5) / scale - 0.5.

@@ -1,14 +1,15 @@
-"""Figures, the self-contained HTML report and the summary in words."""
+"""Figures, self-contained HTML reports, and the summary of a calibration in words."""
 
 from lsvision.report.experiment_pages import calibration_report, product_report
-from lsvision.report.pages import Comparison, ReportFigure, Table, write_report
+from lsvision.report.pages import Headline, Page, ReportFigure, Table, write_report
 from lsvision.report.study_figures import TiltMap
 from lsvision.report.study_pages import Study, study_report
 from lsvision.report.summary import calibration_summary
 from lsvision.report.sweep_pages import SweepJob, sweep_report
 
 __all__ = [
-    "Comparison",
+    "Headline",
+    "Page",
     "ReportFigure",
     "Study",
     "SweepJob",

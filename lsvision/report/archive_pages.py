@@ -5,7 +5,7 @@ from pathlib import Path
 
 from lsvision.archive import ScanRow, product_path
 from lsvision.io import read_product
-from lsvision.report import Comparison, ReportFigure, Table, write_report
+from lsvision.report import Headline, Page, ReportFigure, Table, write_report
 from lsvision.report.drawing import new_figure, show_image, thinned
 
 _MOST_THUMBNAILS = 24
@@ -25,15 +25,14 @@ def reprocess_report(
     failed = [row for row in rows.values() if row.status == "failed"]
     made = [row for row in done if row.status == "done"]
     lines = sum(row.lines for row in made)
-    write_report(
-        folder,
+    page = Page(
         title=f"Archive of {len(rows)} scans",
         lead=f"{len(made)} scans were reprocessed into {output}, {len(rows) - len(made) - len(failed)} were up to date "
         f"and {len(failed)} failed.",
         headlines=[
-            Comparison("Done", str(len(made)), "by this run"),
-            Comparison("Failed", str(len(failed)), f"of {len(rows)} scans"),
-            Comparison("Lines", str(lines), f"in {seconds:.1f} s: {lines / max(seconds, 1e-9):.0f} lines a second"),
+            Headline("Done", str(len(made)), "by this run"),
+            Headline("Failed", str(len(failed)), f"of {len(rows)} scans"),
+            Headline("Lines", str(lines), f"in {seconds:.1f} s: {lines / max(seconds, 1e-9):.0f} lines a second"),
         ],
         tables=[
             Table("Failed scans", ("scan", "reason"), [(row.scan, row.error) for row in failed]),
@@ -50,6 +49,7 @@ def reprocess_report(
         figures=[_thumbnails(made, output)] if made else [],
         settings=settings,
     )  # fmt: skip
+    write_report(page, folder)
 
 
 def _thumbnails(made: Sequence[ScanRow], output: Path) -> ReportFigure:

@@ -1,17 +1,35 @@
-"""Figures of a calibration: convergence, residuals, what was observed."""
+"""Figures of a calibration: convergence, residuals, observed directions."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import torch
-from matplotlib.ticker import MaxNLocator
 from torch import Tensor
 
 from lsvision.geometry import displace, fit_rigid
-from lsvision.report.drawing import AFTER, BEFORE, COLORS, TRUTH, label_axes, new_figure, show_image, thinned
+from lsvision.report.drawing import (
+    AFTER,
+    BEFORE,
+    COLORS,
+    TRUTH,
+    label_axes,
+    new_figure,
+    show_image,
+    thinned,
+    whole_ticks,
+)
 from lsvision.report.pages import ReportFigure
 from lsvision.types import BoardCorners, Calibration
 
 _NOMINAL = (0.0, 1.0, 0.0)
+
+
+@dataclass(frozen=True)
+class BoardView:
+    """An image of a board, ``(rows, columns, channels)``, and the positions of its corners, ``(corners, 2)`` px."""
+
+    image: Tensor
+    corners_px: Tensor
 
 
 def rmse_by_iteration(curves: Mapping[str, Calibration], references: Mapping[str, float] | None = None) -> ReportFigure:
@@ -23,11 +41,11 @@ def rmse_by_iteration(curves: Mapping[str, Calibration], references: Mapping[str
     for name, value in (references or {}).items():
         axes.axhline(value, color=TRUTH, linestyle=":", linewidth=1, label=f"{name}: {value:.3g} mm")
     label_axes(axes, "Error by iteration", "iteration (0: nominal motion)", "RMSE of the corners [mm]")
-    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    whole_ticks(axes)
     figure.legend(loc="outside right upper", fontsize=9)
     caption = (
-        "Root-mean-square distance between measured and true corners. The joint estimate reaches its floor at once; "
-        "alternating between pose and motion removes a constant share each time."
+        "Root-mean-square distance between measured and true corners. The joint estimate is down at its floor after a "
+        "few iterations; a method that alternates between pose and motion removes a constant share in each."
     )
     return ReportFigure("rmse_by_iteration", "RMSE by iteration", caption, figure)
 
@@ -35,7 +53,7 @@ def rmse_by_iteration(curves: Mapping[str, Calibration], references: Mapping[str
 def components_by_iteration(
     curves: Mapping[str, Calibration], truth: Mapping[str, Sequence[float]] | None = None
 ) -> ReportFigure:
-    """Components n1, n2, n3 after every iteration; dashed lines show the truth where it is known."""
+    """Components n1, n2, n3 after every iteration, with the truth as a dashed line if it is known."""
     figure, axes = new_figure(9.5, 3.6, 1, 3)
     for index, panel in enumerate(axes):
         for color, (name, calibration) in zip(COLORS, curves.items(), strict=False):
@@ -44,9 +62,12 @@ def components_by_iteration(
         for value in {n[index] for n in (truth or {}).values()}:
             panel.axhline(value, color=TRUTH, linestyle="--", linewidth=1, label="truth" if index == 0 else None)
         label_axes(panel, f"n{index + 1}", "iteration", f"n{index + 1} [mm per mm]")
-        panel.xaxis.set_major_locator(MaxNLocator(integer=True))
+        whole_ticks(panel)
     figure.legend(loc="outside lower center", ncols=3, fontsize=9)
-    caption = "The displacement of the object per nominal millimetre: sideways, along and in depth."
+    caption = (
+        "True displacement of the object per nominal millimetre of travel: sideways (n1), along (n2), in depth (n3). A "
+        "curve that is still moving at its right end has not converged."
+    )
     return ReportFigure("components_by_iteration", "Components of the motion by iteration", caption, figure)
 
 
@@ -59,9 +80,9 @@ def stretch_by_iteration(curves: Mapping[str, Calibration], truth: float | None 
     if truth is not None:
         axes.axhline(truth, color=TRUTH, linestyle="--", linewidth=1, label=f"truth: {truth:.4f}")
     label_axes(axes, "Stretch by iteration", "iteration", "stretch, true over nominal travel [mm per mm]")
-    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    whole_ticks(axes)
     figure.legend(loc="outside right upper", fontsize=9)
-    caption = "How much further the object moved per line than the encoder or the nominal pitch says."
+    caption = "Length of n: how far the object really moves per millimetre that the pitch or the encoder reports."
     return ReportFigure("stretch_by_iteration", "Stretch by iteration", caption, figure)
 
 
@@ -92,26 +113,26 @@ def corner_positions(
     axes[0].invert_yaxis()
     figure.legend(loc="outside lower center", ncols=3, fontsize=9)
     caption = (
-        "Measured corners in the frame of the board, best pose for each motion: with the nominal motion the board is "
-        "sheared and stretched, with the calibrated one it is square."
+        "Measured corners in the frame of the board, in the pose that fits best, errors enlarged. With the nominal "
+        "motion the board is sheared and stretched; with the calibrated motion it is square."
     )
-    title = "Corners against their true positions" + (f", {label}" if label else "")
+    title = "Corners and their true positions" + (f", {label}" if label else "")
     return ReportFigure(name, title, caption, figure)
 
 
-def corners_on_images(before: tuple[Tensor, Tensor], after: tuple[Tensor, Tensor], pitch_mm: float) -> ReportFigure:
-    """The board's image with its corner points, as scanned and as corrected; each as (image, corners px)."""
+def corners_on_images(before: BoardView, after: BoardView, pitch_mm: float) -> ReportFigure:
+    """The board with its corners marked, as scanned and as corrected; a pixel is ``pitch_mm`` wide."""
     figure, axes = new_figure(10.5, 4.8, 1, 2)
-    for panel, name, (image, corners), color in (
-        (axes[0], "as scanned", before, BEFORE),
-        (axes[1], "corrected", after, AFTER),
-    ):
-        lines, width = image.shape[0] * pitch_mm, image.shape[1] * pitch_mm
-        show_image(panel, thinned(image), (0, width, lines, 0))
-        panel.plot(*(corners * pitch_mm).T, "o", mfc="none", mec=color, ms=5, mew=1)
+    for panel, name, view, color in ((axes[0], "as scanned", before, BEFORE), (axes[1], "corrected", after, AFTER)):
+        length, width = view.image.shape[0] * pitch_mm, view.image.shape[1] * pitch_mm
+        show_image(panel, thinned(view.image), (0, width, length, 0))
+        panel.plot(*(view.corners_px * pitch_mm).T, "o", mfc="none", mec=color, ms=5, mew=1)
         label_axes(panel, name, "across the motion [mm]", "along the motion [mm]")
         panel.grid(False)
-    caption = "One pixel is drawn as one nominal pitch. The angle between the rows and columns of corners turns square."
+    caption = (
+        "A pixel is drawn as one nominal pitch. As scanned, rows and columns of corners meet at a skew angle, after "
+        "the correction at a right angle."
+    )
     return ReportFigure("corners_on_images", "Image and corners before and after", caption, figure)
 
 
@@ -130,12 +151,12 @@ def observability_bars(calibration: Calibration, *, name: str = "observability",
     axes.invert_yaxis()
     label_axes(axes, calibration.observability.verdict, "σ of n along the direction [mm per mm]", "direction of n")
     axes.barh([0], [0], color=AFTER, label="posterior, observed")
-    axes.barh([0], [0], color=BEFORE, label="posterior, repeats the prior")
+    axes.barh([0], [0], color=BEFORE, label="posterior, as wide as the prior")
     figure.legend(loc="outside lower center", ncols=3, fontsize=9)
-    caption = "A direction whose σ hardly shrinks was not measured: " + (
-        calibration.observability.advice or "here all were."
+    caption = "Where the coloured bar is as long as the grey one, the boards did not measure that direction of n. " + (
+        calibration.observability.advice or "Here they measured all."
     )
-    title = "What the boards could tell" + (f", {label}" if label else "")
+    title = "What the boards measured" + (f", {label}" if label else "")
     return ReportFigure(name, title, caption, figure)
 
 

@@ -1,4 +1,4 @@
-"""Figures as a page holds them: vectors for drawings, pixels for images, views from all round for solids."""
+"""Figures in a page: drawings as vectors, images as pixels, figures in three dimensions as a ring of views."""
 
 import base64
 import io
@@ -12,22 +12,22 @@ from mpl_toolkits.mplot3d import Axes3D
 from PIL import Image
 
 _DPI = 110
-# A drawing of more bytes than this, of thousands of points, is smaller as pixels.
+# A drawing of thousands of points, larger than this in bytes, is smaller as pixels.
 _LARGEST_SVG = 400_000
 _VIEWS = 18
-_VIEW_QUALITY = 70  # of WebP; a view of a board takes some 10 kB
+_VIEW_QUALITY = 70  # of WebP; a view of a board then takes about 10 kB
 
 
 @dataclass(frozen=True)
 class Embedded:
-    """Pictures of one figure as data URIs: a single one, or one a view; ``vector`` where it is drawn, not sampled."""
+    """One figure as data URIs: one picture, or one per view; ``vector`` is true for SVG."""
 
     uris: tuple[str, ...]
     vector: bool
 
 
 def embed(figure: Figure, path: Path) -> Embedded:
-    """Save a figure as ``path`` with the endings .png and .svg, and give what a page shows of it."""
+    """Save a figure as ``path`` with the endings .png and .svg, and return the pictures that a page shows."""
     png, svg = _saved(figure, "png"), _saved(figure, "svg")
     path.with_name(f"{path.name}.png").write_bytes(png)
     path.with_name(f"{path.name}.svg").write_bytes(svg)
@@ -40,13 +40,13 @@ def embed(figure: Figure, path: Path) -> Embedded:
 
 
 def _views(figure: Figure, solid: list[Axes3D]) -> list[bytes]:
-    """The figure seen from all round, in equal steps about the vertical, beginning as it is."""
-    figure.set_layout_engine("none")  # its places are found; laying out every view anew would let it jump
+    """Views of a figure turned in equal steps about the vertical, from its present view on."""
+    figure.set_layout_engine("none")  # keep the layout: if every view had its own, the figure would jump
     figure.set_dpi(_DPI)
     canvas = FigureCanvasAgg(figure)
     views = []
     for _ in range(_VIEWS):
-        canvas.draw()  # once a view, where savefig would draw twice
+        canvas.draw()  # savefig would draw every view twice
         buffer = io.BytesIO()
         Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3]).save(buffer, "webp", quality=_VIEW_QUALITY)
         views.append(buffer.getvalue())

@@ -13,18 +13,18 @@ from lsvision.report.calibration_figures import (
     rmse_by_iteration,
     stretch_by_iteration,
 )
-from lsvision.report.pages import Comparison, ReportFigure, Table, write_report
+from lsvision.report.pages import Headline, Page, ReportFigure, Table, write_report
 from lsvision.report.product_figures import product_images
 from lsvision.report.space_figures import corners_in_space, surface_in_space
 from lsvision.report.summary import calibration_summary
 from lsvision.types import BoardCorners, Calibration
 
 _PROVENANCE = ("scan", "calibration", "config_sha256")  # of a product's metadata
-_SHOWN_ROWS = 4000  # of a product, from its start: enough for a look, little enough for any length of scan
+_SHOWN_ROWS = 4000  # of a product, from its start: they fit in memory however long the scan is
 
 
 def calibration_report(calibration: Calibration, boards: Sequence[BoardCorners], settings: dict, folder: Path) -> None:
-    """``report.html`` of a calibration: what n is, how sure, and how every board fits."""
+    """``report.html`` of a calibration: n with its sigma, the observed directions, and the fit of every board."""
     motion = calibration.motion
     sigma = motion.sigma.tolist()
     rows = [
@@ -32,15 +32,14 @@ def calibration_report(calibration: Calibration, boards: Sequence[BoardCorners],
         for fit in calibration.boards
     ]
     curves = {str(calibration.method): calibration}
-    write_report(
-        folder,
+    page = Page(
         title=f"Calibration from {len(boards)} board scan(s)",
         lead=calibration_summary(calibration).splitlines()[0] + ". " + calibration.observability.advice,
         headlines=[
-            Comparison("RMSE", f"{calibration.rmse_after_mm:.4f} mm", f"before: {calibration.rmse_before_mm:.4f} mm"),
-            Comparison("Stretch", f"{motion.stretch:.6f}", "true over nominal travel"),
+            Headline("RMSE", f"{calibration.rmse_after_mm:.4f} mm", f"before: {calibration.rmse_before_mm:.4f} mm"),
+            Headline("Stretch", f"{motion.stretch:.6f}", "true over nominal travel"),
             *(
-                Comparison(f"n{i + 1}", f"{value:+.6f}", f"± {sigma[i]:.1e} mm per mm")
+                Headline(f"n{i + 1}", f"{value:+.6f}", f"± {sigma[i]:.1e} mm per mm")
                 for i, value in enumerate(motion.n.tolist())
             ),
         ],
@@ -61,11 +60,12 @@ def calibration_report(calibration: Calibration, boards: Sequence[BoardCorners],
             "configuration": f"sha256 {calibration.provenance.config_sha256}",
             **{path: f"sha256 {digest}" for path, digest in calibration.provenance.scans},
         },
-    )  # fmt: skip
+    )
+    write_report(page, folder)
 
 
 def product_report(product: Product, valid_share: float, settings: dict, folder: Path) -> None:
-    """``report.html`` of a product: its size, how much was measured, colour and height of its beginning."""
+    """``report.html`` of a product: size, share of valid cells, colour and height of its beginning."""
     rows = min(product.shape[0], _SHOWN_ROWS)
     height = product.height(0, rows)
     measured = height[torch.isfinite(height)]
@@ -76,17 +76,16 @@ def product_report(product: Product, valid_share: float, settings: dict, folder:
         ),
         surface_in_space("surface", height, product.pitch_mm, product.origin_mm),
     ]
-    write_report(
-        folder,
+    page = Page(
         title=f"Corrected scan {product.path.stem}",
         lead=f"Orthographic product of {product.metadata.get('scan', '')} in the frame of its motion.",
         headlines=[
-            Comparison("Size", f"{product.shape[0]} x {product.shape[1]} cells", f"of {product.pitch_mm:.4f} mm"),
-            Comparison("Measured", f"{100 * valid_share:.1f} %", "of all cells"),
-            Comparison("Heights", span, f"first {rows} rows"),
+            Headline("Size", f"{product.shape[0]} x {product.shape[1]} cells", f"of {product.pitch_mm:.4f} mm"),
+            Headline("Measured", f"{100 * valid_share:.1f} %", "of all cells"),
+            Headline("Heights", span, f"first {rows} rows"),
         ],
-        tables=[],
         figures=figures,
         settings=settings,
         provenance={key: str(product.metadata[key]) for key in _PROVENANCE if key in product.metadata},
     )
+    write_report(page, folder)

@@ -2,8 +2,9 @@
 
 import platform
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import torch
 import yaml
@@ -19,7 +20,7 @@ from lsvision.report.embedding import Embedded, embed
 class ReportFigure:
     """A figure with its file name, title and a caption that says what to see.
 
-    Axes in three dimensions are embedded as views from all round, to be turned in the page.
+    A figure in three dimensions is embedded as a ring of views, which the reader turns with a slider.
     """
 
     name: str
@@ -30,7 +31,7 @@ class ReportFigure:
 
 @dataclass(frozen=True)
 class Table:
-    """A table of a report; cells are shown as they are, the first of a row as a link where ``links`` has one for it."""
+    """A table of a report, with text in its cells; the first cell of row i links to ``links[i]`` if links are given."""
 
     title: str
     header: Sequence[str]
@@ -40,12 +41,33 @@ class Table:
 
 
 @dataclass(frozen=True)
-class Comparison:
-    """A headline figure: what it is, its value with unit, and what it is held against."""
+class Headline:
+    """A headline figure: its name, its value with unit, and what to compare it with or how to read it."""
 
     label: str
     value: str
-    against: str = ""
+    context: str = ""
+
+
+@dataclass(frozen=True)
+class Page:
+    """Everything a report shows.
+
+    Attributes:
+        title: of the page.
+        lead: one paragraph that says what was done and what the result is.
+        headlines, tables, figures: in the order of the page.
+        settings: the resolved configuration, shown at the end.
+        provenance: names and hashes of what the results were made from.
+    """
+
+    title: str
+    lead: str
+    headlines: Sequence[Headline]
+    tables: Sequence[Table] = ()
+    figures: Sequence[ReportFigure] = ()
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    provenance: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -56,27 +78,11 @@ class _Shown:
     embedded: Embedded
 
 
-def write_report(
-    folder: Path,
-    *,
-    title: str,
-    lead: str,
-    headlines: Sequence[Comparison],
-    tables: Sequence[Table],
-    figures: Sequence[ReportFigure],
-    settings: dict,
-    provenance: Mapping[str, str] | None = None,
-) -> None:
-    """Write ``report.html`` and ``figures/*.png, *.svg`` into a run's folder.
-
-    Args:
-        lead: one paragraph that says what was done and what came out.
-        settings: the resolved configuration, shown at the end.
-        provenance: what the results were made from, by name, beside the versions that made them.
-    """
+def write_report(page: Page, folder: Path) -> None:
+    """Write ``report.html`` and ``figures/*.png, *.svg`` into a run's folder."""
     pictures = folder / "figures"
     pictures.mkdir(parents=True, exist_ok=True)
-    shown = [_Shown(item, embed(item.figure, pictures / item.name)) for item in figures]
+    shown = [_Shown(item, embed(item.figure, pictures / item.name)) for item in page.figures]
     environment = Environment(
         loader=PackageLoader("lsvision.report"),
         autoescape=select_autoescape(["html", "j2"]),
@@ -84,16 +90,20 @@ def write_report(
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    page = environment.get_template("report.html.j2").render(
-        title=title,
-        lead=lead,
-        headlines=headlines,
-        tables=tables,
+    html = environment.get_template("report.html.j2").render(
+        page=page,
         figures=shown,
-        settings=yaml.safe_dump(settings, sort_keys=False, allow_unicode=True),
-        provenance={**(provenance or {}), **_versions()},
+        settings=yaml.safe_dump(dict(page.settings), sort_keys=False, allow_unicode=True),
+        provenance={**page.provenance, **_versions()},
     )
-    write_text(folder / "report.html", page)
+    write_text(folder / "report.html", html)
+
+
+def cell_text(value: object, digits: int = 6) -> str:
+    """Text of a table's cell: floats to a number of significant digits, nothing for None."""
+    if value is None:
+        return ""
+    return f"{value:.{digits}g}" if isinstance(value, float) else str(value)
 
 
 def _versions() -> dict[str, str]:

@@ -1,4 +1,4 @@
-"""Progress on the terminal; silent where the output is not one."""
+"""Progress bars on a terminal; nothing if the output goes elsewhere."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -34,10 +34,10 @@ class ProgressBars:
 
 
 class RateColumn(ProgressColumn):
-    """Lines, rows or scans a second."""
+    """Lines, rows or scans per second."""
 
     def render(self, task: Task) -> Text:
-        """The rate over the last half minute; nothing before there is one."""
+        """The rate over the last half minute; nothing until it is known."""
         return Text(f"{task.speed:,.0f}/s" if task.speed else "")
 
 

@@ -1,19 +1,27 @@
-"""Figures of a study: accuracy against what was varied, convergence, consistency, and which tilts tell most."""
+"""Figures of a study: accuracy over the varied conditions, convergence, consistency, and the best tilts."""
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 import polars
-from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm
-from matplotlib.ticker import MaxNLocator
 from torch import Tensor
 
-from lsvision.report.drawing import AFTER, BEFORE, COLORS, TRUTH, label_axes, new_figure
+from lsvision.report.drawing import (
+    AFTER,
+    BEFORE,
+    COLORS,
+    TRUTH,
+    label_axes,
+    new_figure,
+    scale_to_values,
+    show_a_decade,
+    whole_ticks,
+)
 from lsvision.report.pages import ReportFigure
+from lsvision.report.study_curves import curves_by, omitted_curves
 
-# What a column is called on an axis.
+# Labels of the axes, by column.
 AXIS_LABELS = {
     "angle_x_deg": "installation angle sideways [deg]",
     "angle_z_deg": "installation angle in depth [deg]",
@@ -30,17 +38,15 @@ AXIS_LABELS = {
     "tilt_spread_deg": "largest angle between two boards [deg]",
 }
 _COMPONENTS = ("n1, sideways", "n2, along", "n3, in depth")
-_MOST_CURVES = len(COLORS)
-_MARKERS = "osD^vP*X"
-_FEW_STEPS = 8  # iterations over which the contraction of a slow method is told
-_SHARES = (0.002, 0.005, 0.01, 0.02, 0.05, 0.5)  # of the prior's sigma, where the map has a contour
+_FEW_STEPS = 8  # iterations over which the contraction of a slow method is averaged
+_SHARES = (0.002, 0.005, 0.01, 0.02, 0.05, 0.5)  # contours of the map, in shares of the prior's sigma
 
 
 @dataclass(frozen=True)
 class TiltMap:
-    """Bound on σ of n's least known direction from a flat board and a second one, by the second's pitch and roll.
+    """Bound on σ of the least known direction of n, from a flat board and a tilted one.
 
-    ``sigma`` is ``(pitches, rolls)`` over ``tilts_deg`` in both directions.
+    ``sigma`` is ``(pitches, rolls)`` of the tilted board, at ``tilts_deg`` on both axes.
     """
 
     tilts_deg: Tensor
@@ -49,40 +55,40 @@ class TiltMap:
 
 
 def accuracy(points: polars.DataFrame, axis: str, others: tuple[str, ...]) -> ReportFigure:
-    """RMS error of each component of n against one numeric column, a curve for each combination of the others."""
+    """RMS error of each component of n over one condition, with a curve for each combination of the others."""
     figure, axes = new_figure(10.5, 4.4, 1, 3)
-    for style, (label, own) in enumerate(_curves(points, others)):
-        color, marker, own = COLORS[style % len(COLORS)], _MARKERS[style], own.sort(axis)
+    for curve in curves_by(points, others):
+        own = curve.points.sort(axis)
         repeated = own[axis].is_duplicated().any()
         for k, panel in enumerate(axes):
-            name = label if k == 0 else None
+            name = curve.label if k == 0 else None
             line, dashed = ("", "_") if repeated else ("-", "--")
-            panel.plot(own[axis], own[f"rms_n{k + 1}"], marker, ls=line, ms=4, color=color, label=name)
-            panel.plot(own[axis], own[f"bound_n{k + 1}"], dashed, color=color, linewidth=1, ms=11)
+            panel.plot(own[axis], own[f"rms_n{k + 1}"], curve.marker, ls=line, ms=4, color=curve.color, label=name)
+            panel.plot(own[axis], own[f"bound_n{k + 1}"], dashed, color=curve.color, linewidth=1, ms=11)
     for k, panel in enumerate(axes):
         panel.set_yscale("log")
         label_axes(panel, _COMPONENTS[k], AXIS_LABELS[axis], "error of n [mm per mm]" if k == 0 else "")
         panel.xaxis.label.set_fontsize(8)
         panel.set_ylabel("rms error [mm per mm]" if k == 0 else "")
-        _spread_axis(panel, points[axis].to_numpy())
-        _at_least_a_decade(panel)
+        scale_to_values(panel, points[axis].to_numpy())
+        show_a_decade(panel)
     axes[0].plot([], [], "--", color=TRUTH, linewidth=1, label="Cramér-Rao bound")
     figure.legend(loc="outside lower center", ncols=3, fontsize=8)
     caption = (
-        "Root-mean-square error over all calibrations of a point, and the smallest that any unbiased estimate could "
-        "have (dashed, or a bar). Where they meet only better corners or other boards help; where the error stands "
-        "above, something disturbs the corners that the calibration does not know of, or it was stopped too early."
+        "Root-mean-square error over all calibrations of a point, and the smallest error that an unbiased estimate can "
+        "have (dashed, or a bar). Where both agree, only better corners or other boards help. Where the error is "
+        "larger, the corners are disturbed in a way that the calibration does not model, or it stopped too early."
     )
     return ReportFigure(
         f"accuracy_{axis}",
-        f"Accuracy against {AXIS_LABELS[axis].split(' [')[0]}",
-        caption + _left_out(points, others),
+        f"Accuracy over {AXIS_LABELS[axis].split(' [')[0]}",
+        caption + omitted_curves(points, others),
         figure,
     )
 
 
 def placings(points: polars.DataFrame) -> ReportFigure:
-    """RMS error of each component of n for every set of boards, beside the prior's sigma."""
+    """RMS error of each component of n for every set of boards, and the prior's sigma."""
     best = points.group_by("boards", maintain_order=True).first()
     figure, axes = new_figure(10.5, 1.7 + 0.32 * len(best), 1, 3, sharey=True)
     rows = range(len(best))
@@ -99,8 +105,8 @@ def placings(points: polars.DataFrame) -> ReportFigure:
     axes[0].barh([0], [0], color=BEFORE, label="prior-dominated")
     figure.legend(loc="outside lower center", ncols=4, fontsize=9)
     caption = (
-        "The same number of calibrations for every set of boards. A set whose bars are orange leaves a direction of n "
-        "at the prior: no number of repeats of it helps, another tilt does."
+        "The same number of calibrations for every set of boards. A set with orange bars does not measure one "
+        "direction of n, which stays at the prior. Repeats of the same boards do not help; another tilt does."
     )
     return ReportFigure("placings", "Which boards to scan", caption, figure)
 
@@ -108,52 +114,55 @@ def placings(points: polars.DataFrame) -> ReportFigure:
 def convergence(iterations: polars.DataFrame, points: polars.DataFrame, others: tuple[str, ...]) -> ReportFigure:
     """RMSE by iteration: median and 5..95 % of the runs, one curve for each combination of conditions."""
     figure, (axes,) = new_figure(8.5, 4.8)
-    for style, (label, own) in enumerate(_curves(points, others)):
-        longest = iterations.filter(polars.col("point").is_in(own["point"].to_list())).sort("iteration")["point"][-1]
-        path = iterations.filter(polars.col("point") == longest)
-        color = COLORS[style % len(COLORS)]
-        label += _contraction(path["median"].to_list())
-        axes.semilogy(path["iteration"], path["median"], _MARKERS[style], ls="-", ms=4, color=color, label=label)
-        axes.fill_between(path["iteration"], path["low"], path["high"], color=color, alpha=0.2, linewidth=0)
+    for curve in curves_by(points, others):
+        own = iterations.filter(polars.col("point").is_in(curve.points["point"].to_list()))
+        longest = own.sort("iteration")["point"][-1]
+        path = own.filter(polars.col("point") == longest)
+        label = curve.label + _contraction(path["median"].to_list())
+        axes.semilogy(path["iteration"], path["median"], curve.marker, ls="-", ms=4, color=curve.color, label=label)
+        axes.fill_between(path["iteration"], path["low"], path["high"], color=curve.color, alpha=0.2, linewidth=0)
     label_axes(axes, "Median and 5..95 % of the runs", "iteration (0: nominal motion)", "RMSE of the corners [mm]")
-    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    whole_ticks(axes)
     figure.legend(loc="outside lower center", ncols=2, fontsize=8)
     caption = (
-        "The joint estimate stands on the floor that the corners' noise leaves after two iterations. Alternating "
-        "between poses and n takes off the share in the legend each time: stopped early, it is far from done."
+        "The joint estimate reaches the floor set by the noise of the corners within two iterations. A method that "
+        "alternates between poses and n removes the share in the legend in each: if it stops early, much error remains."
     )
-    return ReportFigure("convergence", "How fast the methods converge", caption + _left_out(points, others), figure)
+    return ReportFigure(
+        "convergence", "How fast the methods converge", caption + omitted_curves(points, others), figure
+    )
 
 
 def truth_and_estimate(runs: polars.DataFrame, points: polars.DataFrame, others: tuple[str, ...]) -> ReportFigure:
-    """Estimated n3 of every calibration against the true one, a colour for each combination of the other conditions."""
+    """Estimated n3 over the true n3, with a colour for each combination of the other conditions."""
     figure, (axes,) = new_figure(7.5, 5.2)
     table = runs.with_columns((polars.col("n3") - polars.col("error_n3")).alias("true_n3"))
     low, high = table["true_n3"].to_numpy().min(), table["true_n3"].to_numpy().max()
     axes.plot([low, high], [low, high], color=TRUTH, linewidth=1, label="estimate = truth")
-    for style, (label, own) in enumerate(_curves(points, others)):
-        drawn = table.filter(polars.col("point").is_in(own["point"].to_list()))
+    for style, curve in enumerate(curves_by(points, others)):
+        drawn = table.filter(polars.col("point").is_in(curve.points["point"].to_list()))
         by_point = drawn.group_by("point", maintain_order=True).agg(
             polars.col("true_n3").first(),
             polars.col("n3").median(),
             polars.col("sigma_n3").median(),
         )
-        spread = 2 * by_point["sigma_n3"]
-        color = COLORS[style % len(COLORS)]
         beside = by_point["true_n3"] + 0.008 * (high - low) * style  # so that equal estimates do not hide each other
-        axes.errorbar(beside, by_point["n3"], spread, fmt=_MARKERS[style], ms=5, color=color, capsize=3, label=label)
-    label_axes(axes, "Median over the runs, ± 2 σ as claimed", "true n3 [mm per mm]", "estimated n3 [mm per mm]")
+        axes.errorbar(
+            beside, by_point["n3"], 2 * by_point["sigma_n3"],
+            fmt=curve.marker, ms=5, color=curve.color, capsize=3, label=curve.label,
+        )  # fmt: skip
+    label_axes(axes, "Median over the runs, ± 2 σ as stated", "true n3 [mm per mm]", "estimated n3 [mm per mm]")
     figure.legend(loc="outside lower center", ncols=2, fontsize=8)
     caption = (
-        "n3 says how fast the object rises towards the cameras. Estimates on the diagonal know it. A level row says "
-        "the same whatever the truth is: turning one board about the sensor line looks just like another n3, so its "
-        "scan only gives back the prior, and the wide bars admit it. An unfinished estimate is level as well."
+        "n3 is the motion in depth. Estimates on the diagonal are right. Estimates in a level row do not depend on the "
+        "truth: one board turned about the sensor line looks the same as another n3, so its scan only returns the "
+        "prior, with bars as wide as the prior's. An estimate that stopped too early is level as well."
     )
     return ReportFigure("truth_and_estimate", "What one board cannot know: motion in depth", caption, figure)
 
 
 def consistency(points: polars.DataFrame, band: tuple[float, float]) -> ReportFigure:
-    """Error over the bound and normalised squared error of every point, with what they ought to be."""
+    """Error over the bound and normalised squared error of every point, with the ranges of a right estimate."""
     figure, axes = new_figure(9.5, 3.8, 1, 2)
     axes[0].plot(points["point"], points["error_over_bound"], "o", ms=4, color=AFTER)
     axes[0].axhspan(0.94, 1.06, color=TRUTH, alpha=0.2, linewidth=0, label="bound ± 6 %")
@@ -168,17 +177,17 @@ def consistency(points: polars.DataFrame, band: tuple[float, float]) -> ReportFi
         if len(positive) and positive.max() > 5 * positive.min():
             panel.set_yscale("log")
         label_axes(panel, title, "point of the study [index]", y)
-        panel.xaxis.set_major_locator(MaxNLocator(integer=True))
+        whole_ticks(panel)
     figure.legend(loc="outside lower center", ncols=2, fontsize=9)
     caption = (
-        "Left: 1 is as exact as the corners allow. Right: 3, the number of components of n, where the calibrations "
-        "claim the covariance that they have; far above, they are surer than they should be."
+        "Left: 1 is as exact as the corners allow. Right: 3, the number of components of n, if the stated covariance "
+        "is right; far above 3 the calibrations state too small a covariance."
     )
-    return ReportFigure("consistency", "Are the errors what they should be", caption, figure)
+    return ReportFigure("consistency", "Do the errors agree with the stated covariance", caption, figure)
 
 
 def tilt_map(tilts: TiltMap) -> ReportFigure:
-    """Map of the least known direction of n over pitch and roll of the second board."""
+    """Map of σ of the least known direction of n over pitch and roll of the second board."""
     figure, (axes,) = new_figure(7.0, 5.4)
     low, high = float(tilts.tilts_deg[0]), float(tilts.tilts_deg[-1])
     share = (tilts.sigma / tilts.prior_sigma).numpy()
@@ -194,55 +203,17 @@ def tilt_map(tilts: TiltMap) -> ReportFigure:
         "pitch about the sensor axis [deg]",
     )
     axes.grid(False)
-    figure.colorbar(picture, ax=axes, label="σ over the prior's, least known direction [ratio]")
+    figure.colorbar(picture, ax=axes, label="σ of the least known direction over the prior's [ratio]")
     caption = (
-        "Dark: the pair determines all of n. Light: σ stays at the prior's. Keep the second board out of the light "
-        "spot round the centre: some degrees about either axis do, a turn in the board's plane does not."
+        "Dark: the two boards determine all of n. Light: σ stays at the prior's. Keep the second board out of the "
+        "light spot at the centre: a tilt of some degrees about either axis is enough, a turn in its plane is not."
     )
     return ReportFigure("tilt_map", "Map of observability over pitch and roll", caption, figure)
 
 
-def _curves(points: polars.DataFrame, others: tuple[str, ...]) -> Iterator[tuple[str, polars.DataFrame]]:
-    """Points by combination of columns, at most as many as a figure can tell apart, and what they have in common."""
-    if not others:
-        yield "rms error", points
-        return
-    for key, own in list(points.group_by(*others, maintain_order=True))[:_MOST_CURVES]:
-        yield ", ".join(_in_words(name, value) for name, value in zip(others, key, strict=True)), own
-
-
-def _left_out(points: polars.DataFrame, others: tuple[str, ...]) -> str:
-    """A caption's last words where a figure does not show every combination."""
-    count = points.select(others).unique().height if others else 1
-    return f" Shown are the first {_MOST_CURVES} of {count} combinations." if count > _MOST_CURVES else ""
-
-
-def _in_words(name: str, value: object) -> str:
-    if name in ("boards", "method"):
-        return str(value).replace("_", " ")
-    return f"{name} {value:g}" if isinstance(value, float) else f"{name} {value}"
-
-
 def _contraction(rmse_mm: list[float]) -> str:
-    """What each iteration takes off, in words, where there are many."""
+    """The share of the error that an iteration of a slow method removes, for a legend; "" for a fast method."""
     steps = len(rmse_mm) - 1
     if steps <= _FEW_STEPS:
         return ""
-    return f": -{100 * (1 - (rmse_mm[_FEW_STEPS] / rmse_mm[0]) ** (1 / _FEW_STEPS)):.0f} % an iteration"
-
-
-def _at_least_a_decade(panel: Axes) -> None:
-    """Keep a logarithmic axis from blowing up differences that are only noise."""
-    low, high = panel.get_ylim()
-    if high / low < 10:
-        middle = (low * high) ** 0.5
-        panel.set_ylim(middle / 10**0.5, middle * 10**0.5)
-
-
-def _spread_axis(panel: Axes, values: np.ndarray) -> None:
-    """A logarithmic axis where the values span decades, whole ticks where they are counts."""
-    low, high = values.min(), values.max()
-    if low > 0 and high / low > 20:
-        panel.set_xscale("log")
-    elif values.dtype.kind == "i":
-        panel.xaxis.set_major_locator(MaxNLocator(integer=True))
+    return f": -{100 * (1 - (rmse_mm[_FEW_STEPS] / rmse_mm[0]) ** (1 / _FEW_STEPS)):.0f} % per iteration"

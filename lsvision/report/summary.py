@@ -6,7 +6,7 @@ from lsvision.types import Calibration
 
 
 def calibration_summary(calibration: Calibration) -> str:
-    """What the motion is, how sure that is, what is not known and what to do next."""
+    """The motion with its sigma, the directions that were not measured, and the advice on what to scan next."""
     motion, observability = calibration.motion, calibration.observability
     n, sigma = motion.n.tolist(), motion.sigma.tolist()
     angle_x, angle_z = (math.degrees(math.atan2(n[i], n[1])) for i in (0, 2))

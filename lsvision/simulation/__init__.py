@@ -1,11 +1,12 @@
-"""Line-scan renderer: boards, sheets and rails under a stereo rig, with their motion and its truth."""
+"""Line-scan renderer: boards, printed sheets and rails in motion under a stereo rig, with the truth."""
 
 from lsvision.simulation.artwork import artwork
 from lsvision.simulation.config import BoardPose, EncoderConfig, MotionConfig, SceneConfig, SensorConfig
-from lsvision.simulation.scan import Simulation, scaled_rig, simulate
+from lsvision.simulation.scan import Acquisition, Simulation, simulate
 from lsvision.simulation.trajectory import Trajectory
 
 __all__ = [
+    "Acquisition",
     "BoardPose",
     "EncoderConfig",
     "MotionConfig",
@@ -14,6 +15,5 @@ __all__ = [
     "Simulation",
     "Trajectory",
     "artwork",
-    "scaled_rig",
     "simulate",
 ]

@@ -1,5 +1,6 @@
-"""The printed sheet: fine coloured grain under a few marks, one raster of dots that anyone can look up again."""
+"""The printed sheet: fine coloured grain under a few marks, one raster of dots for each scene."""
 
+from dataclasses import dataclass
 from functools import lru_cache
 
 import torch
@@ -9,7 +10,7 @@ from lsvision.simulation.config import SceneConfig
 from lsvision.simulation.noise import Nodes, Raster, lattice_hash, octaves, value_noise
 
 _GRAIN_OCTAVES = 6
-_COLOR_CELLS = 5  # colour varies from the octave of 2**5 dots upwards
+_COLOR_CELLS = 5  # the hue has no finer octave than that of 2**5 dots
 _RINGS, _CROSSES = 8, 8
 _FRAME_MM, _FRAME_INSET_MM = 1.2, 6.0
 _RULER_STEP_MM = 5.0
@@ -17,11 +18,20 @@ _BLACK = (0.04, 0.04, 0.05)
 _RING_INKS = ((0.70, 0.10, 0.10), (0.08, 0.22, 0.62), (0.05, 0.45, 0.18))
 
 
+@dataclass(frozen=True)
+class Marks:
+    """Centres of printed marks and their sizes (arm of a cross, radius of a ring), each ``(count, 1, 1)`` mm."""
+
+    center_x: Tensor
+    center_y: Tensor
+    size: Tensor
+
+
 def artwork(scene: SceneConfig, points_mm: Tensor) -> Tensor:
     """Colour of the printed sheet at points of its frame.
 
     Args:
-        scene: names the size, dot spacing and seed of the sheet.
+        scene: gives the size, dot spacing and seed of the sheet.
         points_mm: ``(*batch, 2 or 3)``, mm from the corner of the sheet, X along its width, Y along its height.
 
     Returns:
@@ -53,17 +63,17 @@ def sheet_raster(scene: SceneConfig) -> Raster:
 
 
 def _print(color: Tensor, share: Tensor, ink: tuple[float, float, float]) -> Tensor:
-    """Lay an ink over the dots, each covered by the given share."""
+    """Print an ink over a share of every dot."""
     return torch.lerp(color, color.new_tensor(ink)[:, None, None].expand_as(color), share[None])
 
 
 def _stroke(distance: Tensor, width: float, dot: float) -> Tensor:
-    """Coverage of dots at a distance from the middle of a stroke, mm."""
+    """Share of a dot that a stroke covers, from its distance to the middle of the stroke; all in mm."""
     return ((width / 2 - distance) / dot + 0.5).clamp(0.0, 1.0)
 
 
 def _border(scene: SceneConfig, x: Tensor, y: Tensor) -> Tensor:
-    """A frame, and a ruler inside its lower edge with a longer tick every tenth step."""
+    """A frame, and a ruler inside its lower edge with longer ticks at every second and tenth step."""
     width, height, dot = scene.sheet_width_mm, scene.sheet_height_mm, scene.texture_mm
     to_edge = torch.minimum(torch.minimum(x, width - x), torch.minimum(y, height - y)) - _FRAME_INSET_MM
     tick = (x / _RULER_STEP_MM).round()
@@ -75,23 +85,23 @@ def _border(scene: SceneConfig, x: Tensor, y: Tensor) -> Tensor:
 
 
 def _crosses(scene: SceneConfig, x: Tensor, y: Tensor) -> Tensor:
-    center_x, center_y, arm = _scattered(scene, _CROSSES, stream=1)
-    along_x, along_y = (x - center_x).abs(), (y - center_y).abs()
+    marks = _scattered(scene, _CROSSES, stream=1)
+    along_x, along_y = (x - marks.center_x).abs(), (y - marks.center_y).abs()
     near, far = torch.minimum(along_x, along_y), torch.maximum(along_x, along_y)
-    return (_stroke(near, 1.2, scene.texture_mm) * (far < arm)).amax(0)
+    return (_stroke(near, 1.2, scene.texture_mm) * (far < marks.size)).amax(0)
 
 
 def _rings(scene: SceneConfig, x: Tensor, y: Tensor) -> Tensor:
-    center_x, center_y, radius = _scattered(scene, _RINGS, stream=2)
-    distance = (torch.hypot(x - center_x, y - center_y) - radius).abs()
+    marks = _scattered(scene, _RINGS, stream=2)
+    distance = (torch.hypot(x - marks.center_x, y - marks.center_y) - marks.size).abs()
     return _stroke(distance, 1.6, scene.texture_mm)
 
 
-def _scattered(scene: SceneConfig, count: int, stream: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Centres and sizes of marks, each (count, 1, 1) mm, clear of the sheet's edges."""
+def _scattered(scene: SceneConfig, count: int, stream: int) -> Marks:
+    """Marks at random places that do not touch the sheet's frame."""
     index = torch.arange(count)
     across, down, size = ((lattice_hash(index, 8 * stream + k, scene.seed) + 1.0) / 2 for k in range(3))
     clear = 28.0
     center_x = clear + across * (scene.sheet_width_mm - 2 * clear)
     center_y = clear + down * (scene.sheet_height_mm - 2 * clear)
-    return tuple(value[:, None, None] for value in (center_x, center_y, 5.0 + 9.0 * size))  # type: ignore[return-value]
+    return Marks(*(value[:, None, None] for value in (center_x, center_y, 5.0 + 9.0 * size)))

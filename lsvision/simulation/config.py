@@ -1,4 +1,4 @@
-"""What a simulated scan is made of, in plain values that a configuration file can hold."""
+"""Options of a simulated scan: scene, motion, sensor, encoder."""
 
 from dataclasses import dataclass, field
 
@@ -9,7 +9,7 @@ class SceneConfig:
 
     A board or sheet is turned by ``R = Rz(yaw) Ry(roll) Rx(pitch)`` about its centre, which crosses the scan plane
     midway between the cameras, ``depth_offset_mm`` behind the plane of zero disparity, on the middle line. A rail runs
-    along the motion and can only roll about it; its crown lies ``rail_rise_mm`` before that depth. The conveyor is a
+    along the motion and can only roll about it; its crown lies ``rail_rise_mm`` above that depth. The conveyor is a
     plane along the motion, ``conveyor_drop_mm`` behind the plane of zero disparity, and is hidden by any target.
     """
 
@@ -36,7 +36,7 @@ class SceneConfig:
 
 @dataclass(frozen=True)
 class MotionConfig:
-    """Motion of the object: a constant direction and stretch, and a smooth vibration that is zero on average.
+    """Motion of the object: a constant direction and stretch, and a smooth vibration of zero mean.
 
     The amplitudes are rms values. Each of x, z and roll is a sum of equal sine waves of the listed wavelengths (in mm
     of nominal travel) with phases drawn from the seed. Roll turns the object about the axis along Y midway between the
@@ -69,10 +69,10 @@ class SensorConfig:
 
 @dataclass(frozen=True)
 class EncoderConfig:
-    """Lines triggered unevenly, and the log of positions an encoder wrote about them.
+    """Unevenly triggered lines and the encoder's log of their positions.
 
-    With ``enabled`` the true nominal position of a line swings by ``wobble_mm`` (rms) around the constant pitch; the
-    log holds it plus white noise of ``noise_mm``.
+    If ``enabled``, the true nominal position of a line swings by ``wobble_mm`` (rms) about the constant pitch. The log
+    is the true position plus white noise of ``noise_mm``.
     """
 
     enabled: bool = False
@@ -84,7 +84,7 @@ class EncoderConfig:
 
 @dataclass(frozen=True)
 class BoardPose:
-    """One placing of the board under the cameras."""
+    """Tilt and depth of a board under the cameras, as in ``SceneConfig``."""
 
     pitch_deg: float
     roll_deg: float

@@ -3,6 +3,8 @@
 A surface position is (s, l): mm around the profile from the crown, and mm along the rail.
 """
 
+from dataclasses import dataclass
+
 import torch
 from torch import Tensor
 
@@ -10,53 +12,79 @@ from lsvision.simulation.config import SceneConfig
 from lsvision.simulation.noise import Nodes, lattice_hash
 
 _PIT, _SCRATCH, _MARK = range(3)
-# Where defects may lie: the crown, up to the start of the 13 mm radius.
+# Defects lie on the crown, up to the start of the 13 mm radius.
 _CROWN_MM = 20.0
 _SCRATCH_LENGTH_MM, _SCRATCH_WIDTH_MM, _SCRATCH_DEPTH_MM, _SCRATCH_SKEW = 45.0, 1.0, 0.25, 0.12
 _PIT_RADIUS_MM, _PIT_DEPTH_MM = (2.0, 4.5), (0.4, 1.0)
 _MARK_RADII_MM, _MARK_DEPTH_MM, _MARK_S_MM = (5.0, 9.0), 0.4, 9.0
+# Relative change of the reflectance in the middle of a defect: scratches show bright metal.
+_PIT_GLOSS, _SCRATCH_GLOSS, _MARK_GLOSS = -0.65, 1.2, -0.55
 
 
-def defects(scene: SceneConfig, nodes: Nodes, seed: int) -> tuple[Tensor, Tensor]:
-    """Depth of the defects, mm into the rail, and their factor on the reflectance, at nodes of (s, l).
+@dataclass(frozen=True)
+class Relief:
+    """A surface at nodes of (s, l), ``(count_y, count_x)`` each.
 
-    Returns:
-        Two float32 tensors ``(count_y, count_x)``: zero and one where the surface is sound.
+    Attributes:
+        depth_mm: depth of the defects, mm into the rail; 0 where the surface is sound.
+        factor: factor on the reflectance; 1 where the surface is sound.
     """
+
+    depth_mm: Tensor
+    factor: Tensor
+
+
+@dataclass(frozen=True)
+class Cells:
+    """Equal lengths of rail, ``spacing_mm`` each, with one defect of a kind at a random place in each.
+
+    ``index`` is ``(cells, 1, 1)``, int64; cell i begins at ``i * spacing_mm`` along the rail.
+    """
+
+    index: Tensor
+    spacing_mm: float
+
+    def draw(self, stream: int, seed: int) -> Tensor:
+        """Uniform value 0..1 of each cell, float64."""
+        return (lattice_hash(self.index, stream, seed).double() + 1.0) / 2
+
+
+def defects(scene: SceneConfig, nodes: Nodes, seed: int) -> Relief:
+    """Depth and reflectance, float32, of all defects of a rail at nodes of (s, l)."""
     s, along = nodes.grid()
-    depth, factor = torch.zeros(nodes.count_y, nodes.count_x), torch.ones(nodes.count_y, nodes.count_x)
+    parts = []
     if scene.defect_spacing_mm > 0:
-        cell = _cells(along, scene.defect_spacing_mm, _SCRATCH_LENGTH_MM)
-        start = cell.double() * scene.defect_spacing_mm
-        for add in (_pits, _scratches):
-            share, deep, gloss = add(s, along, start, cell, scene.defect_spacing_mm, seed)
-            depth, factor = depth + (deep * share).sum(0), factor * (1.0 + gloss * share).prod(0)
+        cells = _cells_near(along, scene.defect_spacing_mm, _SCRATCH_LENGTH_MM)
+        parts += [_pits(s, along, cells, seed), _scratches(s, along, cells, seed)]
     if scene.roll_mark_period_mm > 0:
-        cell = _cells(along, scene.roll_mark_period_mm, _MARK_RADII_MM[1])
-        share = _bowl(
-            (s - _MARK_S_MM) / _MARK_RADII_MM[0], (along - cell * scene.roll_mark_period_mm) / _MARK_RADII_MM[1]
-        )
-        depth, factor = depth + _MARK_DEPTH_MM * share.sum(0), factor * (1.0 - 0.55 * share).prod(0)
-    return depth.float(), factor.float()
+        parts.append(_roll_marks(s, along, _cells_near(along, scene.roll_mark_period_mm, _MARK_RADII_MM[1])))
+    depth, factor = torch.zeros(nodes.count_y, nodes.count_x), torch.ones(nodes.count_y, nodes.count_x)
+    for part in parts:
+        depth, factor = depth + part.depth_mm, factor * part.factor
+    return Relief(depth.float(), factor.float())
 
 
-def _pits(
-    s: Tensor, along: Tensor, start: Tensor, cell: Tensor, spacing: float, seed: int
-) -> tuple[Tensor, Tensor, float]:
-    across, place, size, deep = (_draw(cell, 4 * _PIT + k, seed) for k in range(4))
+def _pits(s: Tensor, along: Tensor, cells: Cells, seed: int) -> Relief:
+    across, place, size, deep = (cells.draw(4 * _PIT + k, seed) for k in range(4))
     radius = _PIT_RADIUS_MM[0] + size * (_PIT_RADIUS_MM[1] - _PIT_RADIUS_MM[0])
-    share = _bowl((s - _CROWN_MM * (2 * across - 1)) / radius, (along - start - place * spacing) / radius)
-    return share, _PIT_DEPTH_MM[0] + deep * (_PIT_DEPTH_MM[1] - _PIT_DEPTH_MM[0]), -0.65
+    depth = _PIT_DEPTH_MM[0] + deep * (_PIT_DEPTH_MM[1] - _PIT_DEPTH_MM[0])
+    run = along - cells.index.double() * cells.spacing_mm - place * cells.spacing_mm
+    share = _bowl((s - _CROWN_MM * (2 * across - 1)) / radius, run / radius)
+    return Relief((depth * share).sum(0), (1.0 + _PIT_GLOSS * share).prod(0))
 
 
-def _scratches(
-    s: Tensor, along: Tensor, start: Tensor, cell: Tensor, spacing: float, seed: int
-) -> tuple[Tensor, Tensor, float]:
-    across, place, skew = (_draw(cell, 4 * _SCRATCH + k, seed) for k in range(3))
-    run = along - start - place * spacing
+def _scratches(s: Tensor, along: Tensor, cells: Cells, seed: int) -> Relief:
+    across, place, skew = (cells.draw(4 * _SCRATCH + k, seed) for k in range(3))
+    run = along - cells.index.double() * cells.spacing_mm - place * cells.spacing_mm
     aside = s - _CROWN_MM * (2 * across - 1) - _SCRATCH_SKEW * (2 * skew - 1) * run
     share = _bowl(aside / _SCRATCH_WIDTH_MM, (run / _SCRATCH_LENGTH_MM - 0.5) * 2.0)
-    return share, place.new_tensor(_SCRATCH_DEPTH_MM), 1.2
+    return Relief((_SCRATCH_DEPTH_MM * share).sum(0), (1.0 + _SCRATCH_GLOSS * share).prod(0))
+
+
+def _roll_marks(s: Tensor, along: Tensor, cells: Cells) -> Relief:
+    """The same mark at the start of every cell, one turn of the roll apart."""
+    share = _bowl((s - _MARK_S_MM) / _MARK_RADII_MM[0], (along - cells.index * cells.spacing_mm) / _MARK_RADII_MM[1])
+    return Relief(_MARK_DEPTH_MM * share.sum(0), (1.0 + _MARK_GLOSS * share).prod(0))
 
 
 def _bowl(a: Tensor, b: Tensor) -> Tensor:
@@ -64,13 +92,8 @@ def _bowl(a: Tensor, b: Tensor) -> Tensor:
     return (1.0 - a * a - b * b).clamp(min=0.0) ** 2
 
 
-def _cells(along: Tensor, spacing: float, reach: float) -> Tensor:
-    """Cells ``(cells, 1, 1)`` whose defects can touch the nodes."""
-    first = int((float(along.min()) - reach) // spacing) - 1
-    last = int((float(along.max()) + reach) // spacing) + 1
-    return torch.arange(first, last + 1)[:, None, None]
-
-
-def _draw(cell: Tensor, stream: int, seed: int) -> Tensor:
-    """Uniform value 0..1 of each cell, float64."""
-    return (lattice_hash(cell, stream, seed).double() + 1.0) / 2
+def _cells_near(along: Tensor, spacing_mm: float, reach_mm: float) -> Cells:
+    """Cells whose defects, ``reach_mm`` long at most, can touch the nodes."""
+    first = int((float(along.min()) - reach_mm) // spacing_mm) - 1
+    last = int((float(along.max()) + reach_mm) // spacing_mm) + 1
+    return Cells(torch.arange(first, last + 1)[:, None, None], spacing_mm)

@@ -1,7 +1,7 @@
 """Endless random textures: value noise on hashed integer lattices.
 
-A texture is a function of integer nodes and a seed, the same wherever and in whatever pieces it is evaluated; between
-the nodes it is interpolated bilinearly.
+A texture is a function of integer nodes and a seed, so any part of it can be evaluated alone. Between the nodes it is
+interpolated bilinearly.
 """
 
 from collections.abc import Sequence
@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.nn.functional import grid_sample
 
 _MASK = 0xFFFFFFFF
-# Nodes of a lattice beyond the samples on either side, so that rounding never asks for one that is not there.
+# Extra nodes on every side of the samples, so that rounding never reaches beyond the lattice.
 _BORDER = 2
 
 
@@ -62,7 +62,7 @@ class Raster:
 
 
 def octaves(count: int, persistence: float = 0.85) -> tuple[Octave, ...]:
-    """Isotropic octaves with cells of 1, 2, 4... nodes; each coarser one weighs ``persistence`` of the finer."""
+    """Isotropic octaves with cells of 1, 2, 4... nodes; each has ``persistence`` times the weight of the next finer."""
     return tuple(Octave(2**k, 2**k, persistence**k) for k in range(count))
 
 

@@ -30,10 +30,11 @@ def view_plane(rays: Rays, pose: Pose, spacing_mm: float) -> PlaneView:
     """Where rays meet the plane Z = 0 of a frame.
 
     With the ray ``o + z (k a + g)`` in the frame, ``z = -o3 / (k a3 + g3)`` and every coordinate is a quotient of two
-    functions linear in k. Their coefficients are formed in float64, one set a line, about a whole number of texture
-    nodes near the lines' middle; the quotient is then exact to micrometres in float32.
+    functions linear in k. Their coefficients are formed in float64, one set per line, and y counts from a whole number
+    of texture nodes near the middle of the lines, so that the float32 quotient is exact to micrometres.
     """
-    origin, across, ahead = rays.within(pose.rotation, pose.translation)
+    local = rays.in_frame(pose)
+    origin, across, ahead = local.origin, local.across, local.ahead
     middle = len(origin) // 2
     middle_y = origin[middle, 1] - origin[middle, 2] * ahead[middle, 1] / ahead[middle, 2]
     base_y = round(float(middle_y) / spacing_mm)
@@ -46,14 +47,13 @@ def view_plane(rays: Rays, pose: Pose, spacing_mm: float) -> PlaneView:
     inverse = torch.reciprocal(torch.addcmul(torch.ones(()), tilt, k))
     x, y = (torch.addcmul(offset[:, c, None], gain[:, c, None], k).mul_(inverse) for c in (0, 1))
     z = inverse.mul_(depth)
-    scan_x = (k + rays.middle_slope).mul(z).add_(rays.camera_x_mm)
-    return PlaneView(x, y, z, scan_x, base_y)
+    return PlaneView(x, y, z, rays.scan_x(z), base_y)
 
 
 def footprint(position: Tensor) -> float:
     """Width, mm, of the box that one sample covers along an axis, from the positions ``(h, w)`` of all samples.
 
-    It has the variance of the sample's true, turned footprint: sides along the sensor and along the motion add squared.
+    It has the variance of the true, turned footprint, whose sides along the sensor and along the motion add in squares.
     """
     i, j = position.shape[0] // 2, position.shape[1] // 2
     here = position[i, j]

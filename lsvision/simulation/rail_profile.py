@@ -1,4 +1,4 @@
-"""Head of the rail 60E1 as a chain of points, and which of them a ray meets first.
+"""Head of the rail 60E1 as a chain of points, and the point that a ray meets first.
 
 Source: EN 13674-1, profile 60E1: crown of radius 300, 80 and 13 mm, 72 mm wide 14.3 mm below the crown, sides 1:20.
 """
@@ -10,12 +10,12 @@ from functools import lru_cache
 import torch
 from torch import Tensor
 
-_STEP_MM = 0.2  # of the chain; an arc of 13 mm then lies within half a micrometre of its chord
+_STEP_MM = 0.2  # of the chain: a chord lies within half a micrometre of an arc of radius 13 mm
 _HALF_WIDTH_300 = 10.228
 _HALF_WIDTH_80 = 26.0265
 _SIDE_MM = 21.2
 _LOWER_RADIUS_MM = 3.0
-_UNDERCUT = math.radians(30.0)  # how far the chain follows the lower edge inwards; steeper than any ray
+_UNDERCUT = math.radians(30.0)  # turn of the chain round the lower edge; steeper than any ray
 
 
 @dataclass(frozen=True)
@@ -23,8 +23,11 @@ class Chain:
     """Points of a convex outline from left to right, ``step_mm`` apart; float64.
 
     Attributes:
-        x: mm, 0 on the crown. z: mm below the crown. angle: of the outward normal from -z towards +x, rad.
-        crown: index of the crown's point.
+        x: mm, 0 on the crown.
+        z: mm below the crown.
+        angle: of the outward normal, from -z towards +x, rad.
+        step_mm: distance of neighbouring points along the outline.
+        crown: index of the point on the crown.
     """
 
     x: Tensor
@@ -62,7 +65,7 @@ def head_60e1() -> Chain:
 
 @dataclass(frozen=True)
 class Hit:
-    """Where rays meet the chain: ``valid`` if at all, the point (x, z), the place s along it and the normal's angle."""
+    """Where rays meet the chain: ``valid`` if they do, the point (x, z), the arc length s, the angle of the normal."""
 
     valid: Tensor
     x: Tensor
@@ -74,8 +77,8 @@ class Hit:
 def slopes_from(chain: Chain, eye_x: Tensor, eye_z: Tensor) -> tuple[Tensor, Tensor]:
     """Slopes dx/dz ``(h, points)`` at which eyes ``(h,)`` above the chain see its points, and the visible horizon.
 
-    From the crown, which nothing hides, outwards a point is hidden exactly if one before it lies further out; the
-    horizon is the running extreme, and it does not decrease from left to right.
+    Nothing hides the crown. From there outwards, a point is hidden exactly if an earlier point has a larger slope. The
+    horizon is that running extreme; it does not decrease from left to right.
     """
     slopes = (chain.x - eye_x[:, None]) / (chain.z - eye_z[:, None])
     left = slopes[:, : chain.crown + 1].flip(-1).cummin(-1).values.flip(-1)
@@ -88,7 +91,8 @@ def first_hit(chain: Chain, slopes: Tensor, horizon: Tensor, eye_z: Tensor, ray:
 
     Args:
         slopes, horizon: of ``slopes_from``, float32 ``(h, points)``.
-        eye_z: height of the eyes in the chain's frame, mm, negative above the crown.
+        eye_z: z of the eyes in the frame of the chain, mm, negative above the crown.
+        ray: slopes of the rays, float32 ``(h, w)``.
     """
     valid = (ray > horizon[:, :1]) & (ray < horizon[:, -1:])
     after = torch.searchsorted(horizon, ray.contiguous()).clamp_(1, len(chain.x) - 1)

@@ -1,17 +1,16 @@
 """Simulated line-scan stereo scans, rendered strip by strip."""
 
 import dataclasses
-import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from lsvision.errors import ConfigError
-from lsvision.geometry import project
+from lsvision.geometry import Camera, project
 from lsvision.simulation.config import EncoderConfig, MotionConfig, SceneConfig, SensorConfig
 from lsvision.simulation.noise import lattice_hash
 from lsvision.simulation.scene import build_scene, place, scene_lines
@@ -20,22 +19,37 @@ from lsvision.simulation.surfaces import Look, Scene
 from lsvision.simulation.trajectory import Trajectory, cast_rays
 from lsvision.types import Board, Pose, Rig, Transport, Travel
 
-Camera = Literal["left", "right"]
-
-# Lines rendered at once. Blocks lie at multiples of it whatever strips are asked for, so every strip height gives the
-# same bits; 32 lines of samples stay near the processor's cache.
+# Lines rendered at once. Blocks begin at multiples of it, so that strips of every height have the same bits; 32 lines
+# of samples fit the processor's cache.
 _BLOCK = 32
 _LOG_STREAM = 7
 
 
 @dataclass(frozen=True)
+class Acquisition:
+    """How the lines of a scan are triggered.
+
+    Attributes:
+        line_pitch_mm: nominal travel per line.
+        lines: length of the scan; None for a scan that shows the whole target and its margin.
+        transport: "reverse" turns the image upside down.
+        encoder: uneven trigger and its log; None for a constant pitch.
+    """
+
+    line_pitch_mm: float
+    lines: int | None = None
+    transport: Transport = "forward"
+    encoder: EncoderConfig | None = None
+
+
+@dataclass(frozen=True)
 class Simulation:
-    """One simulated pass of an object under the rig; nothing is rendered before it is asked for.
+    """One simulated pass of an object under the rig; images are rendered strip by strip, as they are read.
 
     Attributes:
         lines: number of lines.
-        travel: what the scan's file would say about the travel: the constant pitch, or the encoder's log.
-        pose: where the target stands, ``p = R p_target + T`` in the scan frame.
+        travel: as the scan's file states it: the constant pitch, or the encoder's log.
+        pose: of the target, ``p = R p_target + T`` in the scan frame.
         trajectory: the true motion, vibration and uneven travel included.
     """
 
@@ -73,12 +87,12 @@ class Simulation:
     def corners(self) -> tuple[Tensor, Tensor]:
         """True pixel positions (column, line) of the board's corners in the left and right image, float64."""
         points = self.board.corner_points() @ self.pose.rotation.mT + self.pose.translation
-        x, line, z = self.trajectory.project(points)
+        x, line, z = self.trajectory.project(points).unbind(-1)
         left, right = project(self.rig, x, z)
         return torch.stack([left, line], dim=-1), torch.stack([right, line], dim=-1)
 
     def truth(self) -> dict[str, Any]:
-        """What was simulated, as plain values for a JSON file.
+        """The truth of the scan as plain values for a JSON file.
 
         ``n``, ``stretch``, ``R``, ``T``, ``lines``, the settings under ``args``, and for a board its corners as
         (column, line) in the order of ``Board.corner_points``.
@@ -118,7 +132,7 @@ class Simulation:
         return expose(light, self.sensor, int((float(seed) + 1.0) * 2**30))
 
     def _look(self, camera: Camera, columns: Tensor, lines: Tensor) -> Look:
-        """What samples see; the colours of a trilinear sensor look at planes of their own."""
+        """Colour and depth that samples see; each colour of a trilinear sensor looks at another plane."""
         spacing = self.rig.color_spacing_lines
         if not any(spacing):
             return self._scene.look(cast_rays(self.trajectory, camera, columns, lines))
@@ -126,7 +140,7 @@ class Simulation:
         return Look(torch.stack([look.color[c] for c, look in enumerate(looks)]), looks[1].z)
 
     def _look_channel(self, camera: Camera, columns: Tensor, lines: Tensor, spacing: float) -> Look:
-        """One colour, seen ``spacing`` lines further along Y; a registering camera takes it that much sooner."""
+        """One colour, seen ``spacing`` lines further along Y, and that much earlier if the camera registers colours."""
         if self.sensor.color_registered:
             lines = lines - self.trajectory.sign * spacing
         plane_y = spacing * self.trajectory.line_pitch_mm
@@ -139,49 +153,28 @@ def simulate(
     scene: SceneConfig,
     motion: MotionConfig,
     sensor: SensorConfig,
-    line_pitch_mm: float,
-    *,
-    lines: int | None = None,
-    transport: Transport = "forward",
-    encoder: EncoderConfig | None = None,
+    acquisition: Acquisition,
 ) -> Simulation:
     """Set up a scan of a board, sheet or rail.
 
     Args:
-        rig: the cameras. board: drawn where ``scene.kind`` is "board".
-        line_pitch_mm: nominal travel per line.
-        lines: length of the scan; chosen so that the target fits with its margin where it is None.
-        transport: "reverse" turns the image upside down.
-        encoder: uneven line trigger with a log; None for a constant pitch.
+        rig: the cameras.
+        board: the target if ``scene.kind`` is "board".
+        scene, motion, sensor: the object, how it moves, and what sees it.
+        acquisition: pitch and number of the lines, transport, encoder.
 
     Raises:
-        ConfigError: an option that no scan can be made with; the message names it.
+        ConfigError: an option has a value that no scan can have; the message names it.
     """
-    _check(scene, sensor, motion, line_pitch_mm, lines)
-    trajectory = Trajectory(rig, motion, encoder or EncoderConfig(), line_pitch_mm, transport)
+    _check(scene, sensor, motion, acquisition)
+    pitch = acquisition.line_pitch_mm
+    trajectory = Trajectory(rig, motion, acquisition.encoder or EncoderConfig(), pitch, acquisition.transport)
+    lines = acquisition.lines
     if lines is None:
-        lines = scene_lines(board, scene, trajectory.n, line_pitch_mm)
-    middle_mm = trajectory.sign * line_pitch_mm * (lines - 1) / 2
+        lines = scene_lines(board, scene, trajectory.n, pitch)
+    middle_mm = trajectory.sign * pitch * (lines - 1) / 2
     pose = place(rig, board, scene, trajectory.n, middle_mm)
     return Simulation(rig, board, scene, sensor, trajectory, _logged_travel(trajectory, lines), lines, pose)
-
-
-def scaled_rig(rig: Rig, scale: float) -> Rig:
-    """The same cameras with ``scale`` times larger pixels, over the same field; the line pitch should grow as much.
-
-    Source: the edge of the first pixel stays where it is, so a column c becomes (c + 0.5) / scale - 0.5.
-    """
-    if scale < 1:
-        raise ValueError(f"scale must be at least 1, got {scale}")
-    red, green, blue = rig.color_spacing_lines
-    return dataclasses.replace(
-        rig,
-        width_px=math.ceil(rig.width_px / scale),
-        pixel_pitch_um=rig.pixel_pitch_um * scale,
-        principal_left_px=(rig.principal_left_px + 0.5) / scale - 0.5,
-        principal_right_px=(rig.principal_right_px + 0.5) / scale - 0.5,
-        color_spacing_lines=(red / scale, green / scale, blue / scale),
-    )
 
 
 def _logged_travel(trajectory: Trajectory, lines: int) -> Travel:
@@ -193,18 +186,14 @@ def _logged_travel(trajectory: Trajectory, lines: int) -> Travel:
     generator = torch.Generator().manual_seed(encoder.seed * 8 + _LOG_STREAM)
     log = position + encoder.noise_mm * torch.randn(lines, generator=generator, dtype=torch.float64)
     if not bool((log.diff() > 0).all()):
-        raise ConfigError(
-            "encoder.wobble_mm, encoder.noise_mm: so uneven that the log runs backwards at this line pitch"
-        )
+        raise ConfigError("encoder.wobble_mm, encoder.noise_mm: too large for this line pitch, the log runs backwards")
     return Travel(pitch, log, trajectory.transport)
 
 
-def _check(
-    scene: SceneConfig, sensor: SensorConfig, motion: MotionConfig, line_pitch_mm: float, lines: int | None
-) -> None:
+def _check(scene: SceneConfig, sensor: SensorConfig, motion: MotionConfig, acquisition: Acquisition) -> None:
     problems = {
-        "line_pitch_mm: must be positive": line_pitch_mm > 0,
-        "lines: must be at least 1": lines is None or lines >= 1,
+        "line_pitch_mm: must be positive": acquisition.line_pitch_mm > 0,
+        "lines: must be at least 1": acquisition.lines is None or acquisition.lines >= 1,
         "scene.kind: must be board, sheet or rail": scene.kind in ("board", "sheet", "rail"),
         "scene.texture_mm: must be positive": scene.texture_mm > 0,
         "scene: a rail runs along the motion; pitch_deg and yaw_deg must be 0": scene.kind != "rail"

@@ -1,27 +1,26 @@
-"""Where a target stands and what lies around it."""
+"""Pose of a target, and the conveyor and lights around it."""
 
 import math
 
 import torch
 from torch import Tensor
 
-from lsvision.geometry import product_axes, rotation_from_vector
+from lsvision.geometry import aligned_rotation, middle_point, rotation_from_vector
 from lsvision.simulation.config import SceneConfig
 from lsvision.simulation.lighting import line_lights
 from lsvision.simulation.rail import RailScene
-from lsvision.simulation.surfaces import BoardScene, Conveyor, Scene, SheetScene, board_extent
+from lsvision.simulation.surfaces import BoardScene, Conveyor, Scene, SheetScene, squares_of
 from lsvision.types import Board, Pose, Rig
 
 
 def place(rig: Rig, board: Board, scene: SceneConfig, n: Tensor, middle_mm: float) -> Pose:
-    """Pose of a target whose centre crosses the scan plane midway between the cameras after a travel of ``middle_mm``.
+    """Pose of a target whose centre crosses the scan plane midway between the cameras at the travel ``middle_mm``.
 
-    A rail's frame has its Y along the motion n; roll turns it about that axis.
+    Y of a rail's frame runs along the motion n; roll turns the rail about it.
     """
-    depth = rig.zero_disparity_mm + scene.depth_offset_mm
-    middle = n.new_tensor([rig.baseline_mm / 2, 0.0, depth]) + middle_mm * n
+    middle = middle_point(rig) + n.new_tensor([0.0, 0.0, scene.depth_offset_mm]) + middle_mm * n
     if scene.kind == "rail":
-        rotation = product_axes(n).mT @ _turn(0.0, scene.roll_deg, 0.0)
+        rotation = aligned_rotation(n) @ _turn(0.0, scene.roll_deg, 0.0)
         return Pose(rotation, middle - n.new_tensor([0.0, 0.0, scene.rail_rise_mm]))
     rotation = _turn(scene.pitch_deg, scene.roll_deg, scene.yaw_deg)
     outline = _outline(board, scene)
@@ -30,7 +29,7 @@ def place(rig: Rig, board: Board, scene: SceneConfig, n: Tensor, middle_mm: floa
 
 
 def scene_lines(board: Board, scene: SceneConfig, n: Tensor, line_pitch_mm: float) -> int:
-    """Lines of a scan that shows the whole target and its margin, or the length of rail asked for."""
+    """Lines of a scan that shows the whole target and its margin, or the length ``rail_length_mm`` of a rail."""
     if scene.kind == "rail":
         return math.ceil(scene.rail_length_mm / line_pitch_mm)
     rotation = _turn(scene.pitch_deg, scene.roll_deg, scene.yaw_deg)
@@ -39,10 +38,10 @@ def scene_lines(board: Board, scene: SceneConfig, n: Tensor, line_pitch_mm: floa
 
 
 def build_scene(rig: Rig, board: Board, scene: SceneConfig, pose: Pose, n: Tensor) -> Scene:
-    """Target, conveyor and lights; n is the motion along which conveyor and rail run."""
+    """Target, conveyor and lights; conveyor and rail run along the motion n."""
     lighting = line_lights(rig)
-    ground = n.new_tensor([rig.baseline_mm / 2, 0.0, rig.zero_disparity_mm + scene.conveyor_drop_mm])
-    conveyor = Conveyor(Pose(product_axes(n).mT, ground), lighting, scene.texture_mm, scene.seed)
+    ground = middle_point(rig) + n.new_tensor([0.0, 0.0, scene.conveyor_drop_mm])
+    conveyor = Conveyor(Pose(aligned_rotation(n), ground), lighting, scene.texture_mm, scene.seed)
     if scene.kind == "board":
         return BoardScene(board, scene, pose, lighting, conveyor)
     if scene.kind == "sheet":
@@ -53,9 +52,10 @@ def build_scene(rig: Rig, board: Board, scene: SceneConfig, pose: Pose, n: Tenso
 def _outline(board: Board, scene: SceneConfig) -> Tensor:
     """Corners (4, 2) of a board or sheet in its own frame, mm."""
     if scene.kind == "board":
-        side, right, bottom = board_extent(board)
+        squares = squares_of(board)
         border = torch.tensor([scene.board_border_x_mm, scene.board_border_y_mm], dtype=torch.float64)
-        low, high = -side - border, torch.tensor([right, bottom], dtype=torch.float64) + border
+        low = -squares.side_mm - border
+        high = torch.tensor([squares.right_mm, squares.bottom_mm], dtype=torch.float64) + border
     else:
         high = torch.tensor([scene.sheet_width_mm, scene.sheet_height_mm], dtype=torch.float64)
         low = torch.zeros_like(high)

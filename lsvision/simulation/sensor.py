@@ -8,7 +8,7 @@ from torch.nn.functional import conv2d
 
 from lsvision.simulation.config import SensorConfig
 
-# The blur is cut where a Gaussian has fallen to a hundredth.
+# The blur is cut at three sigma, where a Gaussian has fallen to a hundredth of its peak.
 _BLUR_REACH = 3.0
 
 

@@ -1,4 +1,4 @@
-"""Points of a printed sheet found again in a scan and in its product, against the artwork they were printed from."""
+"""Points of a printed sheet, found in a scan and in its product, compared with the artwork of the sheet."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -26,7 +26,7 @@ from lsvision.simulation.config import SceneConfig
 from lsvision.simulation.scan import Simulation
 from lsvision.types import DepthSource, LineImage, ProductGrid, Scan, TensorImage
 
-_PATCH_PX = 12  # half the side of a patch that is looked for
+_PATCH_PX = 12  # half the side of a patch
 _SEARCH_PX = 8
 _DEPTH_WINDOW_PX = 12
 _EDGE_MM = 15.0
@@ -36,9 +36,9 @@ _LEAST_CORRELATION = 0.6
 
 @dataclass(frozen=True)
 class SheetPoints:
-    """Points of the sheet ``(points, 3)``, mm: on the artwork, and as measured, brought into the sheet's frame.
+    """Points of the sheet ``(points, 3)``, mm, in its frame: on the artwork and as measured.
 
-    ``shift_px`` is the distance from where the truth puts a point in the image to where it was found.
+    ``shift_px`` is the distance of a point in the image from its true position.
     """
 
     true_mm: Tensor
@@ -52,7 +52,7 @@ class SheetPoints:
 
 
 def points_in_scan(scan: Scan, depth: DepthSource, simulation: Simulation) -> SheetPoints:
-    """The sheet as the scan shows it, taken at its nominal motion."""
+    """Points of the sheet measured in a scan under the nominal motion."""
     sheet, pose, n = sheet_grid(simulation.scene), simulation.pose, simulation.trajectory.n
     true = scan_position(transform(pose.rotation, pose.translation, sheet), n)
     u, _ = project(scan.rig, true[:, 0], true[:, 2])
@@ -77,7 +77,7 @@ def points_in_scan(scan: Scan, depth: DepthSource, simulation: Simulation) -> Sh
 def points_in_product(
     color: LineImage, height: LineImage, grid: ProductGrid, n: Tensor, simulation: Simulation
 ) -> SheetPoints:
-    """The sheet as the product shows it, made with a motion n."""
+    """Points of the sheet measured in a product that was made with a motion n."""
     sheet, pose = sheet_grid(simulation.scene), product_pose(simulation.pose, n)
     rotation, translation = pose.rotation, pose.translation
     origin = n.new_tensor([grid.origin_x_mm, grid.origin_y_mm])
@@ -113,10 +113,10 @@ def _sheet_points(sheet: Tensor, measured: Tensor, shift: Tensor, valid: Tensor)
 def _find(
     image: Tensor, expected: Tensor, to_sheet: Callable[[Tensor], Tensor], scene: SceneConfig
 ) -> tuple[Tensor, Tensor]:
-    """Positions (column, row) of patches of the artwork near where they are expected, px, and which were found."""
+    """Positions (column, row), px, of patches of the artwork near the expected ones, and which patches were found."""
     span = torch.arange(-_PATCH_PX, _PATCH_PX + 1, dtype=torch.float64)
     offset = torch.stack(torch.meshgrid(span, span, indexing="xy"), dim=-1)
-    centre = expected.round()  # patches are drawn on whole pixels, so that a match is a shift of the expected place
+    centre = expected.round()  # patches are drawn on whole pixels; a match gives the shift from there
     patches = gray(artwork(scene, to_sheet(centre[:, None, None] + offset)).flatten(0, 1)).reshape(
         -1, *offset.shape[:2]
     )
@@ -135,7 +135,7 @@ def _find(
 
 
 def _peak(score: np.ndarray) -> Tensor | None:
-    """Position (column, row) of the greatest correlation to a fraction of a pixel; None at the rim or if it is weak."""
+    """Sub-pixel position (column, row) of the largest correlation; None at the rim or if the correlation is weak."""
     row, column = np.unravel_index(int(score.argmax()), score.shape)
     if score[row, column] < _LEAST_CORRELATION:
         return None

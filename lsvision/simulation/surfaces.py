@@ -1,4 +1,4 @@
-"""Flat printed targets and the conveyor under them: the colour that each ray brings back."""
+"""Flat printed targets and the conveyor under them: the colour and depth that each ray sees."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -15,7 +15,7 @@ from lsvision.simulation.plane import PlaneView, coverage, footprint, square_wav
 from lsvision.simulation.trajectory import Rays
 from lsvision.types import Board, Pose
 
-_INK = 0.05  # reflectance of a black square, of a white one's
+_INK = 0.05  # reflectance of a black square over that of a white one
 _BOARD_TINT = (0.84, 0.82, 0.79)
 _CONVEYOR_TINT = (0.205, 0.200, 0.185)
 _CONVEYOR_CONTRAST = 0.25
@@ -24,14 +24,14 @@ _OCTAVES = octaves(6)
 
 @dataclass(frozen=True)
 class Look:
-    """What rays bring back: colour ``(3, h, w)``, a perfectly white and fully lit surface being 1, and depth z, mm."""
+    """Colour ``(3, h, w)`` that rays see, 1 for a perfectly white and fully lit surface, and depth z ``(h, w)``, mm."""
 
     color: Tensor
     z: Tensor
 
 
 class Scene(Protocol):
-    """Anything that rays can look at."""
+    """Surfaces under the cameras."""
 
     def look(self, rays: Rays) -> Look:
         """Colour and depth of the first surface that each ray meets."""
@@ -70,8 +70,12 @@ class BoardScene:
         """Colour and depth; the edges of the squares are filtered over the box of each sample."""
         view = view_plane(rays, self.pose, self.config.texture_mm)
         x, y = view.x, view.y + view.base_y * self.config.texture_mm
-        side, right, bottom = board_extent(self.board)
-        border_x, border_y = self.config.board_border_x_mm, self.config.board_border_y_mm
+        squares, border_x, border_y = (
+            squares_of(self.board),
+            self.config.board_border_x_mm,
+            self.config.board_border_y_mm,
+        )
+        side, right, bottom = squares.side_mm, squares.right_mm, squares.bottom_mm
         width_x, width_y = footprint(x), footprint(y)
         inside = coverage(x, -side - border_x, right + border_x, width_x)
         inside *= coverage(y, -side - border_y, bottom + border_y, width_y)
@@ -83,11 +87,12 @@ class BoardScene:
 
     @cached_property
     def _grain(self) -> Raster:
-        """Weak texture of the whole board, which gives stereo matching something to hold."""
-        side, right, bottom = board_extent(self.board)
-        corners = torch.tensor([[-side, -side], [right, bottom]]) + torch.tensor([[-1.0], [1.0]]) * torch.tensor(
-            [self.config.board_border_x_mm, self.config.board_border_y_mm]
-        )
+        """Weak texture of the whole board, without which stereo matching finds nothing on its plain squares."""
+        squares = squares_of(self.board)
+        side = squares.side_mm
+        corners = torch.tensor([[-side, -side], [squares.right_mm, squares.bottom_mm]])
+        border = torch.tensor([self.config.board_border_x_mm, self.config.board_border_y_mm])
+        corners = corners + torch.tensor([[-1.0], [1.0]]) * border
         nodes = covering(corners[:, 0], corners[:, 1], self.config.texture_mm)
         grain = value_noise(nodes, _OCTAVES, 8 * self.config.seed + 5)
         return Raster(grain.mul_(self.config.board_texture).add_(1.0)[None], nodes)
@@ -112,9 +117,19 @@ class SheetScene:
         return over(self.conveyor.look(rays), Look(color, view.z), inside)
 
 
-def board_extent(board: Board) -> tuple[float, float, float]:
-    """Side of a square, and right and lower end of the pattern in the board frame; it begins at minus one side, mm."""
-    return board.square_mm, (board.columns - 1) * board.square_mm, (board.rows - 1) * board.square_mm
+@dataclass(frozen=True)
+class Squares:
+    """Side of a board's squares and where they end in its frame, mm; they begin at minus one side on both axes."""
+
+    side_mm: float
+    right_mm: float
+    bottom_mm: float
+
+
+def squares_of(board: Board) -> Squares:
+    """The squares of a board, whose frame has its origin at the first inner corner."""
+    side = board.square_mm
+    return Squares(side, (board.columns - 1) * side, (board.rows - 1) * side)
 
 
 def over(below: Look, above: Look, share: Tensor) -> Look:

@@ -1,6 +1,6 @@
-"""The true motion of the object: where each of its points is on each line, and the rays that see it.
+"""The true motion of the object: the position of its points on every line, and the rays that see them.
 
-On line v the object's own point p stands in the scan frame at
+On line v the object's own point p lies in the scan frame at
 
     P = Rroll(v) (p - y n - c) + c + (dx(v), 0, dz(v)),     y = the true nominal travel of line v,
 
@@ -8,18 +8,19 @@ with Rroll a rotation about Y and c = (B/2, 0, z0). Without vibration that is p 
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
+from lsvision.geometry import Camera, camera_center_mm, middle_point, slope_at
 from lsvision.simulation.config import EncoderConfig, MotionConfig
 from lsvision.simulation.noise import lattice_hash
-from lsvision.types import Rig, Transport
+from lsvision.types import Pose, Rig, Transport
 
-# One phase stream per thing that swings.
+# One stream of random phases for each quantity that swings.
 _X, _Z, _ROLL, _WOBBLE = range(4)
-# Fixed-point steps that invert the uneven travel; each gains at least a digit for any wobble a log can follow.
+# Fixed-point steps that invert the uneven travel; each gains a digit or more for any wobble that a log can follow.
 _INVERSION_STEPS = 40
 
 
@@ -48,7 +49,7 @@ class Trajectory:
     @property
     def pivot(self) -> Tensor:
         """Point c on the axis of roll, mm, float64 (3,)."""
-        return torch.tensor([self.rig.baseline_mm / 2, 0.0, self.rig.zero_disparity_mm], dtype=torch.float64)
+        return middle_point(self.rig)
 
     def position(self, line: Tensor) -> Tensor:
         """True nominal travel y, mm, of (fractional) lines, float64."""
@@ -75,14 +76,16 @@ class Trajectory:
             dim=-1,
         )
 
-    def project(self, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """x (mm), line and z (mm) at which the object's own points ``(*batch, 3)``, mm, cross the scan plane."""
+    def project(self, points: Tensor) -> Tensor:
+        """Places (x mm, line, z mm), ``(*batch, 3)``, where the object's own points, mm, cross the scan plane."""
         y = points[..., 1].double() / self.n[1]  # neither roll about Y nor dx, dz moves a point along Y
         line = self.line_at(y)
         dx, dz, roll = self.vibration(line).unbind(-1)
         x, _, z = (points - y[..., None] * self.n - self.pivot).unbind(-1)
         cos, sin = torch.cos(roll), torch.sin(roll)
-        return cos * x + sin * z + self.pivot[0] + dx, line, cos * z - sin * x + self.pivot[2] + dz
+        return torch.stack(
+            [cos * x + sin * z + self.pivot[0] + dx, line, cos * z - sin * x + self.pivot[2] + dz], dim=-1
+        )
 
     def _wobble(self, even: Tensor) -> Tensor:
         if not self.encoder.enabled:
@@ -92,7 +95,7 @@ class Trajectory:
 
 @dataclass(frozen=True)
 class Rays:
-    """What one camera's columns see on some lines, in the object's own coordinates.
+    """Rays of one camera's columns on some lines, in the object's own coordinates.
 
     The point at depth z on column j of line i is ``origin[i] + z (slope[j] across[i] + ahead[i])``; in the scan frame
     its x is ``camera_x_mm + z (slope[j] + middle_slope)``. Lines are float64, slopes float32 about the middle column,
@@ -106,25 +109,43 @@ class Rays:
     camera_x_mm: float
     middle_slope: float
 
-    def within(self, rotation: Tensor, translation: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Origin, across and ahead seen from a frame with ``p = rotation p_frame + translation``."""
-        return (self.origin - translation) @ rotation, self.across @ rotation, self.ahead @ rotation
+    def in_frame(self, pose: Pose) -> "Rays":
+        """The same rays in the coordinates of a target's frame; depths and slopes stay those of the scan frame."""
+        rotation, translation = pose.rotation, pose.translation
+        return replace(
+            self,
+            origin=(self.origin - translation) @ rotation,
+            across=self.across @ rotation,
+            ahead=self.ahead @ rotation,
+        )
+
+    def on_columns(self, columns: slice) -> "Rays":
+        """The rays of some columns."""
+        return replace(self, slope=self.slope[columns])
+
+    def direction(self, axis: int) -> Tensor:
+        """One coordinate of every ray's direction, ``(lines, columns)`` float32, mm per mm of depth."""
+        across, ahead = self.across[:, axis].float(), self.ahead[:, axis].float()
+        return torch.addcmul(ahead[:, None], across[:, None], self.slope[None])
+
+    def scan_x(self, z: Tensor) -> Tensor:
+        """x in the scan frame, mm, of the points at depths z ``(lines, columns)``, mm."""
+        return (self.slope[None] + self.middle_slope).mul(z).add_(self.camera_x_mm)
 
 
-def cast_rays(trajectory: Trajectory, camera: str, columns: Tensor, lines: Tensor, plane_y_mm: float = 0.0) -> Rays:
+def cast_rays(trajectory: Trajectory, camera: Camera, columns: Tensor, lines: Tensor, plane_y_mm: float = 0.0) -> Rays:
     """Rays of the left or right camera through columns ``(w,)`` px on (fractional) lines ``(h,)``, float64.
 
     Args:
         trajectory: the true motion.
         camera: "left" or "right".
-        plane_y_mm: Y of the plane that the sensor line looks at; zero but for a trilinear sensor.
+        columns, lines: positions, px and lines.
+        plane_y_mm: Y of the plane that the sensor line sees; zero except for a trilinear sensor.
     """
     rig = trajectory.rig
-    left = camera == "left"
-    principal = rig.principal_left_px if left else rig.principal_right_px
-    camera_x = 0.0 if left else rig.baseline_mm
-    middle_slope = ((rig.width_px - 1) / 2 - principal) / rig.focal_length_px
-    slope = (columns.double() - principal) / rig.focal_length_px - middle_slope
+    camera_x = camera_center_mm(rig, camera)
+    middle_slope = slope_at(rig, (rig.width_px - 1) / 2, camera)
+    slope = slope_at(rig, columns.double(), camera) - middle_slope
     dx, dz, roll = trajectory.vibration(lines).unbind(-1)
     cos, sin, zero = torch.cos(roll), torch.sin(roll), torch.zeros_like(roll)
     across = torch.stack([cos, zero, sin], -1)  # columns of the inverse of Rroll

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from lsvision.errors import ConfigError
-from lsvision.simulation import BoardPose, MotionConfig, SceneConfig, SensorConfig, Simulation, simulate
+from lsvision.simulation import Acquisition, BoardPose, MotionConfig, SceneConfig, SensorConfig, Simulation, simulate
 from lsvision.stages.calibration.config import CalibrationConfig
 from lsvision.stages.calibration.model import BoardProblem, join_state, motion_information, nominal_problem
 from lsvision.types import Board, CalibrationMethod, Rig
@@ -117,7 +117,7 @@ def exact_corners(
     points = []
     for simulation in simulations:
         pose = simulation.pose
-        x, line, z = simulation.trajectory.project(body @ pose.rotation.mT + pose.translation)
+        x, line, z = simulation.trajectory.project(body @ pose.rotation.mT + pose.translation).unbind(-1)
         points.append(torch.stack([x, line * _LINE_PITCH_MM, z], dim=-1))
     return ExactCorners(
         points=torch.stack(points),
@@ -156,4 +156,4 @@ def true_problem(corners: ExactCorners, chol: Tensor) -> tuple[BoardProblem, Ten
 def _simulation(rig: Rig, board: Board, pose: BoardPose, conditions: Conditions) -> Simulation:
     scene = SceneConfig(kind="board", **asdict(pose))
     motion = MotionConfig(conditions.angle_x_deg, conditions.angle_z_deg, conditions.stretch)
-    return simulate(rig, board, scene, motion, SensorConfig(), _LINE_PITCH_MM)
+    return simulate(rig, board, scene, motion, SensorConfig(), Acquisition(_LINE_PITCH_MM))

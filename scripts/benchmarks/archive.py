@@ -1,7 +1,7 @@
-"""A mixed archive through the commands: do engines, workers and strips agree to the bit, and what does a rerun cost?
+"""A mixed archive through the commands: are all products bit-equal on any engine, workers and strips? And a rerun?
 
-200 small scans, half of them with a depth map, and one of 131 072 lines at 1786 px, made of repeated random texture.
-It takes some minutes and 20 GB of disk.
+The archive has 200 small scans, half of them with a depth map, and one of 131 072 lines of 1786 px, all of repeated
+random texture. The benchmark takes some minutes and 20 GB of disk.
 """
 
 import hashlib
@@ -13,6 +13,7 @@ from pathlib import Path
 
 import torch
 
+from lsvision.geometry import zero_disparity_mm
 from lsvision.io import read_product, write_calibration, write_scan
 from lsvision.types import Calibration, Motion, Observability, Rig, Travel
 
@@ -33,7 +34,7 @@ RUNS = {
 
 
 def run() -> dict[str, object]:
-    """Seconds of every run from nothing, whether their products are equal, and an unchanged rerun."""
+    """Seconds of every run from scratch and of an unchanged rerun, and whether all products are equal."""
     with tempfile.TemporaryDirectory() as folder:
         root = Path(folder)
         calibration = _make_archive(root / "archive")
@@ -55,13 +56,13 @@ def run() -> dict[str, object]:
 
 
 def _make_archive(root: Path) -> Path:
-    """Scans of a texture a few pixels off the plane of zero disparity; returns the calibration's path."""
+    """Write scans of a texture near the plane of zero disparity and a calibration; return the calibration's path."""
     random = torch.Generator().manual_seed(0)
     noise = torch.rand(3, 1, PATTERN_LINES, RIG.width_px, generator=random)
     texture = torch.nn.functional.avg_pool2d(noise, 3, 1, 1)[:, 0].movedim(0, -1)
     left = ((texture - 0.5) * 400 + 128).clamp(0, 255).to(torch.uint8)
     right = left.roll(-SHIFT_PX, 1)
-    depth = torch.full((SMALL_LINES, RIG.width_px, 1), RIG.zero_disparity_mm - 1.0)
+    depth = torch.full((SMALL_LINES, RIG.width_px, 1), zero_disparity_mm(RIG) - 1.0)
     for number in range(SMALL):
         lines = slice(number * 16, number * 16 + SMALL_LINES)
         stereo = number % 2 == 1
@@ -98,7 +99,7 @@ def _reprocess(root: Path, calibration: Path, output: Path, *options: str) -> fl
 
 
 def _digests(output: Path) -> dict[str, str]:
-    """A hash of what every product holds, however it is cut into chunks."""
+    """A hash of the content of every product, which does not depend on its chunks."""
     found = {}
     for path in sorted(output.glob("*.zarr")):
         product, digest = read_product(path), hashlib.sha256()

@@ -1,6 +1,6 @@
-"""One joint calibration of three boards of 88 corners against scipy's least squares on the same residuals.
+"""One joint calibration of three boards of 88 corners, compared with scipy's least squares on the same residuals.
 
-Ours includes what it says of itself: covariance, consistency of the residuals, observability and the next tilt.
+Ours also computes the covariance, the consistency of the residuals, the observed directions and the next tilt.
 """
 
 import math
@@ -38,7 +38,7 @@ def boards() -> list[BoardCorners]:
 
 
 def run() -> dict[str, object]:
-    """Milliseconds per calibration of both, the best of turns taken one after the other, and their difference in n."""
+    """Milliseconds per calibration of both, the best of alternating turns, and their difference in n."""
     torch.set_num_threads(1)
     corners = boards()
     points, covariance, body, valid = (

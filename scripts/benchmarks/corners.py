@@ -1,7 +1,7 @@
-"""Corners of a board at full size: this library against OpenCV's findChessboardCornersSB on the same image, one thread.
+"""Corners of a full-size board, compared with OpenCV's findChessboardCornersSB on the same image, one thread.
 
 The image is rendered: 7142 px wide, noise 3 of 255, blur 1 px, sheared and stretched as a moving board is. Errors are
-those against the renderer's truth.
+differences from the renderer's truth.
 """
 
 import math
@@ -13,7 +13,7 @@ from torch import Tensor
 
 from lsvision.image.board.detect import detect_board, order_grid
 from lsvision.image.brightness import gray
-from lsvision.simulation import MotionConfig, SceneConfig, SensorConfig, simulate
+from lsvision.simulation import Acquisition, MotionConfig, SceneConfig, SensorConfig, simulate
 from lsvision.types import Board, Rig, TensorImage
 
 RIG = Rig(7142, 10.0, 113.84, 354.0, 1042.0, 6099.0)
@@ -22,7 +22,7 @@ TURNS = 3
 
 
 def run() -> dict[str, object]:
-    """Seconds and errors of both; ``ratio`` is OpenCV's time over ours, by the best turn of each."""
+    """Seconds and errors of both; ``ratio`` is OpenCV's time over ours in the best turn of each."""
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
     image, truth = _rendered()
@@ -52,7 +52,7 @@ def _rendered() -> tuple[Tensor, Tensor]:
     scene = SceneConfig("board", pitch_deg=2.0, roll_deg=1.5, yaw_deg=8.0, texture_mm=0.15, board_texture=0.0)
     motion = MotionConfig(angle_x_deg=3.0, stretch=1.0246)
     sensor = SensorConfig(noise=3.0, blur_px=1.0, supersampling=2)
-    source = simulate(RIG, BOARD, scene, motion, sensor, 0.07)
+    source = simulate(RIG, BOARD, scene, motion, sensor, Acquisition(0.07))
     return torch.cat(list(source.strips("left"))), source.corners()[0]
 
 

@@ -1,8 +1,8 @@
-"""Nine-state filters on board corners: this library's batch against filterpy's CubatureKalmanFilter in a Python loop.
+"""Nine-state filters on board corners: a batch, compared with filterpy's CubatureKalmanFilter in a Python loop.
 
-Both predict a random walk and take 50 measurements of three values each, one thread each. filterpy's points are redrawn
-after the prediction, which its own update leaves out. Its time per filter and step does not depend on how many filters
-the loop runs over, so it is measured on a dozen of them.
+Both predict a random walk and update with 50 measurements of three values, on one thread. filterpy's points are
+redrawn after the prediction, which its own update omits. Its time per filter and step does not depend on the number of
+filters in the loop, so a dozen of them are timed.
 """
 
 import math
@@ -26,7 +26,7 @@ CORNERS = [(30.0 * (step % 11) - 150.0, 30.0 * (step // 11) - 75.0) for step in 
 
 
 def corner(states: Tensor, step: int) -> Tensor:
-    """Measured (x, y, z) of the step's corner R(theta) p + t, brought to the scan plane by the motion n."""
+    """Measured (x, y, z) of the step's corner R(theta) p + t, which the motion n carries to the scan plane."""
     a, b, c, t1, t2, t3, n1, n2, n3 = states.unbind(-1)
     px, py = CORNERS[step]
     half = torch.addcmul(a * a, b, b).addcmul_(c, c).sqrt_().div_(2)
@@ -43,7 +43,7 @@ def corner(states: Tensor, step: int) -> Tensor:
 
 
 def corner_of_one(state: np.ndarray, step: int) -> np.ndarray:
-    """The same for one state, in plain floats: faster for filterpy than arrays of three."""
+    """``corner`` of one state, in plain floats, which filterpy takes faster than small arrays."""
     a, b, c, t1, t2, t3, n1, n2, n3 = state.tolist()
     px, py = CORNERS[step]
     half = math.sqrt(a * a + b * b + c * c) / 2

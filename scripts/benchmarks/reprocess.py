@@ -1,6 +1,6 @@
-"""An archive through the engines against the bare stage calls in one loop: lines a second, overhead, memory.
+"""An archive through the engines, compared with the bare stages in one loop: lines per second, overhead, memory.
 
-Workers are started and have imported everything before the clock runs; starting them is told apart.
+The time to start the workers and to import the package is not counted.
 """
 
 import resource
@@ -48,7 +48,7 @@ PROCESSING = Processing(DisparityConfig(matcher="sgbm"), CorrectionConfig(), Fal
 
 @dataclass(frozen=True)
 class Usage:
-    """The most memory, in KiB, that the worker which runs it ever took, and its processor seconds as text."""
+    """Peak memory, KiB, of the worker that runs the task, and its processor seconds as text."""
 
     number: int
 
@@ -59,7 +59,7 @@ class Usage:
 
 
 def make_archive(root: Path) -> Path:
-    """Scans of a textured plane, a few pixels off the plane of zero disparity; returns the calibration's path."""
+    """Write scans of a textured plane near zero disparity and a calibration; return the calibration's path."""
     random = torch.Generator().manual_seed(0)
     for number in range(SCANS):
         noise = torch.rand(3, 1, LINES, RIG.width_px, generator=random)
@@ -75,7 +75,7 @@ def make_archive(root: Path) -> Path:
 
 
 def bare(archive: Path, calibration: Path, output: Path) -> float:
-    """Seconds of the stages themselves, scan after scan, and their product written."""
+    """Seconds of the bare stages, scan after scan, with their products written."""
     motion, config = read_calibration(calibration).motion, PROCESSING.correction
     begin = time.perf_counter()
     for found in find_scans(str(archive)):
@@ -92,7 +92,7 @@ def bare(archive: Path, calibration: Path, output: Path) -> float:
 
 
 def through(engine: Engine, archive: Path, calibration: Path, output: Path) -> float:
-    """Seconds of the same through an engine, ledger, kept depth and all."""
+    """Seconds of the same scans through an engine, with its ledger and depth store."""
     output.mkdir()
     begin = time.perf_counter()
     with Ledger(output / LEDGER_FILE) as ledger:
@@ -105,7 +105,7 @@ def through(engine: Engine, archive: Path, calibration: Path, output: Path) -> f
 
 
 def usage(engine: Engine, workers: int) -> tuple[int, float]:
-    """The most memory, MB, that a worker took so far, and the processor seconds of a lone worker and this process."""
+    """Peak memory, MB, of the workers so far, and the processor seconds of the first worker and this process."""
     for number in range(workers):
         engine.submit(Task("usage", Usage(number)))
     found: list[TaskResult] = []
@@ -123,7 +123,7 @@ def started(make: Callable[[], Engine], workers: int) -> Iterator[Engine]:
 
 
 def run() -> dict[str, object]:
-    """Lines a second of the bare stages and of every engine, medians of turns taken one after the other."""
+    """Lines per second of the bare stages and of every engine, medians of alternating turns."""
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
     keep_freed_memory()  # as the command that corrects one scan does, and every worker

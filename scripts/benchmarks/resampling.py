@@ -1,8 +1,8 @@
-"""Correction of full-width scans against OpenCV, in one run on one machine, on as many threads as torch takes.
+"""Correction of full-width scans, compared with OpenCV in one run on one machine, on torch's default threads.
 
 Colour and height of a surface in motion are resampled by ``sample_images`` and, with the same maps, by a bare
-``cv2.remap``; both in strips, from one scan to product rows. The correction that makes those maps is timed too, and so
-is a copy of as many bytes as colour and height hold. Memory is that of a process of its own for each length.
+``cv2.remap``, both in strips from one scan to product rows. The correction that makes the maps is timed as well, and
+so is a copy of the bytes of colour and height. A new process for each length of scan measures the memory.
 """
 
 import json
@@ -19,6 +19,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from lsvision.geometry import zero_disparity_mm
 from lsvision.image.brightness import gray_bytes
 from lsvision.image.resampling import SAMPLED_TILES, Interpolation, Resampler, Sampling, sample_images
 from lsvision.image.tiling import in_parallel, keep_freed_memory, tiles
@@ -43,7 +44,7 @@ MATCHING = DisparityConfig(largest_sigma_px=0.2)
 
 @dataclass(frozen=True)
 class Repeated:
-    """A tall image that shows the same lines again and again, made where it is read."""
+    """A tall image that repeats the same lines, without storing more than them."""
 
     lines: Tensor
     height: int
@@ -60,8 +61,17 @@ class Repeated:
         return self.lines[torch.arange(start, stop) % len(self.lines)]
 
 
+@dataclass(frozen=True)
+class ResamplingSpeeds:
+    """Mpx/s of ours by interpolation and library and of a bare remap by interpolation; largest differences by unit."""
+
+    ours: dict[str, float]
+    remap: dict[str, float]
+    largest_difference: dict[str, float]
+
+
 def surface_scan(lines: int) -> Scan:
-    """A wavy sheet with a raised block and missing depths: as a camera with a matcher of its own delivers it."""
+    """A wavy sheet with a raised block and missing depths, as from a camera that computes depth maps."""
     generator = torch.Generator().manual_seed(0)
     u, v = torch.arange(RIG.width_px), torch.arange(1024)[:, None]
     noise = torch.randn(1024, RIG.width_px, generator=generator)
@@ -75,17 +85,17 @@ def surface_scan(lines: int) -> Scan:
 def run() -> dict[str, object]:
     """Mpx/s of both, their ratios, and megabytes at three lengths; ``ratio`` is that of bicubic colour and height."""
     keep_freed_memory()
-    ours, bare, largest = resampling_speeds()
-    ratios = {name: round(ours[name] / bare[name.split()[0]], 2) for name in ours}
+    speeds = resampling_speeds()
+    ratios = {name: round(speed / speeds.remap[name.split()[0]], 2) for name, speed in speeds.ours.items()}
     stereo = scan_speeds()
     return {
         "unit": "Mpx/s of the product",
-        "resampling": {name: round(value, 1) for name, value in ours.items()},
-        "cv2.remap": {name: round(value, 1) for name, value in bare.items()},
+        "resampling": {name: round(value, 1) for name, value in speeds.ours.items()},
+        "cv2.remap": {name: round(value, 1) for name, value in speeds.remap.items()},
         "memcpy": round(memcpy_speed(), 1),
         "ratios": ratios,
         "ratio": ratios["bicubic grid_sample"],
-        "largest_difference": largest,
+        "largest_difference": speeds.largest_difference,
         "correction_of_a_depth_map_scan": round(depth_map_speed(), 2),
         "correction_of_a_stereo_scan": {name: round(value, 2) for name, value in stereo.items()},
         "stereo_ratios": {
@@ -99,8 +109,8 @@ def run() -> dict[str, object]:
     }
 
 
-def resampling_speeds() -> tuple[dict[str, float], dict[str, float], dict[str, float]]:
-    """Ours by interpolation and library, bare ``cv2.remap`` by interpolation, and the largest differences of both."""
+def resampling_speeds() -> ResamplingSpeeds:
+    """Sample a strip by ``sample_images`` and by a bare ``cv2.remap`` with the same maps."""
     scan = surface_scan(2048)
     grid = plan_product(scan, MOTION, CONFIG)
     strip = Correction(scan, depth_of(scan), MOTION, CONFIG, grid).strip((768, 768 + STRIP))
@@ -108,9 +118,9 @@ def resampling_speeds() -> tuple[dict[str, float], dict[str, float], dict[str, f
     start = int(source[..., 0].nan_to_num(nan=1e9).min()) - 4
     stop = int(source[..., 0].nan_to_num(nan=0.0).max()) + 5
     line, column = source[..., 0] - start, source[..., 1].contiguous()
-    filled = [values.nan_to_num(nan=8.0).numpy() for values in (column, line)]  # the peer knows no holes
+    filled = [values.nan_to_num(nan=8.0).numpy() for values in (column, line)]  # cv2.remap cannot skip missing cells
     color = scan.left.read(start, stop)
-    height = (RIG.zero_disparity_mm - scan.images.depth.read(start, stop)).nan_to_num(nan=0.0)
+    height = (zero_disparity_mm(RIG) - scan.images.depth.read(start, stop)).nan_to_num(nan=0.0)
 
     def ours(mode: Interpolation, resampler: Resampler) -> tuple[Tensor, Tensor]:
         made = torch.empty(*line.shape, 3, dtype=torch.uint8), torch.empty(*line.shape, 1)
@@ -142,7 +152,11 @@ def resampling_speeds() -> tuple[dict[str, float], dict[str, float], dict[str, f
         "grey values": float((found[0].int() - expected[0].int())[known].abs().max()),
         "mm": float((found[1] - expected[1])[known].abs().max()),
     }
-    return {name: speeds[name] for name in speeds if " " in name}, {mode: speeds[mode] for mode in modes}, largest
+    return ResamplingSpeeds(
+        ours={name: speeds[name] for name in speeds if " " in name},
+        remap={mode: speeds[mode] for mode in modes},
+        largest_difference=largest,
+    )
 
 
 def depth_map_speed() -> float:
@@ -156,7 +170,7 @@ def depth_map_speed() -> float:
 
 
 def stereo_scan(lines: int) -> Scan:
-    """A textured plane in two views, as long as it is wanted."""
+    """A textured plane in two views, of any length."""
     generator = torch.Generator().manual_seed(0)
     texture = torch.randint(0, 256, (1024, RIG.width_px + 200, 3), dtype=torch.uint8, generator=generator)
     texture = torch.from_numpy(cv2.GaussianBlur(texture.numpy(), (0, 0), 1.5))
@@ -167,7 +181,7 @@ def stereo_scan(lines: int) -> Scan:
 def scan_speeds() -> dict[str, float]:
     """Mpx/s of correcting a stereo scan, matching included, and of OpenCV alone: SGBM over the same range and a remap.
 
-    OpenCV's SGBM has two ways through the costs in one pass: five directions on one thread, or three on all.
+    OpenCV's SGBM aggregates the costs of one pass in five directions on one thread, or in three on all threads.
     """
     scan = stereo_scan(STEREO_LINES)
     grid = plan_product(scan, MOTION, CONFIG)
@@ -198,7 +212,7 @@ def scan_speeds() -> dict[str, float]:
 
 
 def memcpy_speed() -> float:
-    """Mpx/s of copying colour and height, seven bytes a pixel."""
+    """Mpx/s of copying colour and height, seven bytes per pixel."""
     source = torch.zeros(7 * STRIP * RIG.width_px, dtype=torch.uint8)
     target = torch.empty_like(source)
     seconds = median_seconds({"copy": lambda: target.copy_(source)})["copy"]
@@ -206,7 +220,7 @@ def memcpy_speed() -> float:
 
 
 def median_seconds(sides: dict[str, Callable[[], object]], turns: int = TURNS) -> dict[str, float]:
-    """Median time of each side; the sides take turns, so that a slow moment of the machine meets all of them."""
+    """Median seconds of each side; the sides take turns, so that a slow moment of the machine affects all of them."""
     taken: dict[str, list[float]] = {name: [] for name in sides}
     for turn in range(turns + 1):
         for name, side in sides.items():
@@ -218,7 +232,7 @@ def median_seconds(sides: dict[str, Callable[[], object]], turns: int = TURNS) -
 
 
 def peak_megabytes(lines: int, kind: str = "depth") -> int:
-    """Peak memory of a process that corrects a scan of a number of lines, with a depth map or stereo."""
+    """Peak memory, MB, of a process that corrects a scan of the given length, with a depth map or stereo."""
     code = f"import resampling; resampling.correct_and_report({lines}, {kind!r})"
     folder = str(Path(__file__).parent)
     result = subprocess.run([sys.executable, "-c", code], cwd=folder, capture_output=True, text=True, check=True)
@@ -226,11 +240,11 @@ def peak_megabytes(lines: int, kind: str = "depth") -> int:
 
 
 def correct_and_report(lines: int, kind: str) -> None:
-    """Correct a scan and print the megabytes that it took."""
+    """Correct a scan and print the peak memory of the process, MB."""
     keep_freed_memory()
     scan = stereo_scan(lines) if kind == "stereo" else surface_scan(lines)
     for _ in correct_scan(scan, depth_of(scan, MATCHING), MOTION, CONFIG):
         pass
-    # Not getrusage: its maximum begins with that of the process that started this one.
+    # Not getrusage: its maximum includes that of the parent process.
     status = dict(line.split(":", 1) for line in Path("/proc/self/status").read_text().splitlines())
     print(int(status["VmHWM"].split()[0]) // 1024)

@@ -1,8 +1,8 @@
-"""Calibrations of three boards of 88 corners: a study's batches against a loop over scipy.optimize.least_squares.
+"""Calibrations of three boards of 88 corners: a study's batches, compared with a loop over scipy's least_squares.
 
 Both start from the best fits of the boards under the nominal motion, estimate the same 21 unknowns from the same noisy
-corners under the same prior, and give n with its covariance. The study uses two threads, as it does by default; the
-loop cannot. scipy gets a residual vectorised in numpy and its own defaults: trust region, derivatives by differences.
+corners under the same prior, and return n with its covariance. The study runs on two threads, its default; the loop
+runs on one. scipy has a residual vectorised in numpy and its default settings: trust region, finite differences.
 """
 
 import statistics
@@ -25,7 +25,7 @@ RUNS, PEER_RUNS, TURNS, THREADS = 2048, 96, 7, 2
 
 
 class Peer:
-    """One calibration after the other by scipy."""
+    """Calibrations one after the other by scipy."""
 
     def __init__(self, settings: StudySettings) -> None:
         self.point = settings.conditions
@@ -57,7 +57,7 @@ class Peer:
 
 
 def run() -> dict[str, object]:
-    """Calibrations a second of both, in turns; ``ratio`` is the median over the turns."""
+    """Calibrations per second of both in alternating turns; ``ratio`` is the median over the turns."""
     with initialize_config_dir(str(config_folder()), version_base="1.3"):
         values = OmegaConf.to_container(compose("config", ["+experiment=study_tilts"]), resolve=True)
     settings = build_settings(StudySettings, values)
@@ -76,7 +76,7 @@ def run() -> dict[str, object]:
         error = np.abs(found.n[:PEER_RUNS].numpy() - n) / found.covariance[0].diagonal().sqrt().numpy()
         difference = max(difference, float(error.max()))
     return {
-        "unit": "calibrations of 3 x 88 corners a second",
+        "unit": "calibrations of 3 x 88 corners per second",
         "lsvision": round(statistics.median(ours), 1),
         "scipy": round(statistics.median(theirs), 1),
         "ratio": round(statistics.median(a / b for a, b in zip(ours, theirs, strict=True)), 1),

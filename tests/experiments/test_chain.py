@@ -19,7 +19,7 @@ TILTS = {"a": (2.0, 1.5, 0.0), "b": (-5.0, 1.0, 6.0), "c": (4.0, -3.0, -8.0)}
 
 @pytest.fixture(scope="module")
 def scans(tmp_path_factory):
-    """Three boards, scanned askew and stretched."""
+    """Scans of three boards under a skewed and stretched motion."""
     folder = tmp_path_factory.mktemp("scans")
     with initialize_config_dir(str(config_folder()), version_base="1.3"):
         for name, (pitch, roll, yaw) in TILTS.items():

@@ -1,4 +1,4 @@
-"""The paper, start to end."""
+"""The paper's experiment from start to end."""
 
 import json
 

@@ -13,7 +13,7 @@ import torch
 import zarr.storage._local
 
 from lsvision.io import read_calibration, read_product, read_scan, write_calibration, write_encoder, write_scan
-from lsvision.simulation import SceneConfig, SensorConfig, Simulation, simulate
+from lsvision.simulation import Acquisition, SceneConfig, SensorConfig, Simulation, simulate
 from lsvision.types import Calibration, Motion, Observability
 from tests.stages.rendered import BOARD, MOTION, PITCH, SMALL_RIG
 
@@ -32,7 +32,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A depth-map scan of a tilted board, ``scan``, and its ``calibration.json``."""
     folder = tmp_path_factory.mktemp("made")
     board = SceneConfig(pitch_deg=3.0, roll_deg=2.0)
-    simulation = simulate(SMALL_RIG, BOARD, board, MOTION, SensorConfig(supersampling=3), PITCH)
+    simulation = simulate(SMALL_RIG, BOARD, board, MOTION, SensorConfig(supersampling=3), Acquisition(PITCH))
     write_scan(
         folder / "scan",
         rig=simulation.rig,

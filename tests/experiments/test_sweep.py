@@ -1,4 +1,4 @@
-"""Sweeps: every job is in the table and the report, with its results or the reason why it has none."""
+"""Sweeps: every job is in the table and the report, with its results or the reason of its failure."""
 
 import json
 import os
@@ -20,7 +20,7 @@ SWEEP = ("--multirun", "+experiment=study", "runs=1,2,3,4,5,6", "conditions.meth
 
 @pytest.fixture
 def toy(monkeypatch):
-    """An experiment of no cost that fails for two of the twelve jobs, once as expected and once by a bug."""
+    """A cheap experiment that fails in two of the twelve jobs, once with an expected error and once by a bug."""
 
     def experiment(settings, folder):
         if settings.runs == 3 and settings.conditions.method == "joint":
@@ -65,7 +65,7 @@ def test_a_sweep_without_failures_exits_with_zero(toy, command, tmp_path, capsys
     assert "Failed jobs" not in (tmp_path / "sweep" / "report.html").read_text()
 
 
-def test_a_killed_job_is_told_and_collected_afterwards(toy, command, tmp_path, capsys):
+def test_a_killed_job_is_reported_and_collected_afterwards(toy, command, tmp_path, capsys):
     folder = tmp_path / "sweep"
     assert command("--multirun", "+experiment=study", "runs=1,2", f"hydra.sweep.dir={folder}") == 0
     (folder / "1" / "job.json").unlink()

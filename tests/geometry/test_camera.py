@@ -8,9 +8,11 @@ from lsvision.geometry import (
     CoplanarRig,
     Intersection,
     project,
+    scaled_rig,
     triangulate,
     triangulate_general,
     triangulation_jacobian,
+    zero_disparity_mm,
 )
 from lsvision.types import Rig
 
@@ -163,3 +165,15 @@ def test_gradient_of_good_points_survives_bad_ones() -> None:
 def test_dtype_follows_the_input(dtype: torch.dtype) -> None:
     x, z = triangulate(FULL, torch.zeros(3, dtype=dtype), torch.zeros(3, dtype=dtype))
     assert x.dtype == z.dtype == dtype
+
+
+def test_scaled_rig_keeps_the_field_and_its_edge() -> None:
+    rig = scaled_rig(FULL, 4)
+    assert rig.width_px == 1786
+    torch.testing.assert_close(
+        [rig.pixel_pitch_um, rig.principal_left_px, rig.principal_right_px, zero_disparity_mm(rig)],
+        [40.0, 260.125, 1524.375, zero_disparity_mm(FULL)],
+    )
+    assert scaled_rig(FULL, 1) == FULL
+    with pytest.raises(ValueError, match="scale"):
+        scaled_rig(FULL, 0.5)

@@ -1,4 +1,4 @@
-"""A calibration that is determined, one that repeats its prior, and the corners of a board."""
+"""A determined calibration, one that repeats its prior, and the corners of a board."""
 
 import dataclasses
 

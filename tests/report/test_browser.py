@@ -1,4 +1,4 @@
-"""Reports in a real browser: nothing on its console, nothing asked of the network, readable at every width."""
+"""Reports in a real browser: no message on its console, no request to the network, readable at every width."""
 
 import json
 import shutil
@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from lsvision.report import Comparison, ReportFigure, Table, calibration_report, write_report
+from lsvision.report import Headline, Page, ReportFigure, Table, calibration_report, write_report
 from lsvision.report.product_figures import product_images
 from lsvision.report.space_figures import surface_in_space
 
@@ -21,7 +21,7 @@ FLAGS = (
     "--host-resolver-rules=MAP * ~NOTFOUND, EXCLUDE 127.0.0.1",
 )  # fmt: skip
 
-# Run by the page under test after it has loaded: what it shows, and whether turning and zooming work.
+# A script that the page under test runs after it has loaded: it lists what the page shows, turns and zooms a figure.
 PROBE = """
 <script>
 addEventListener("load", () => {
@@ -64,16 +64,16 @@ def folder(tmp_path, determined, corners):
         product_images("product", "Colour and height", color, height, 0.5, (0.0, 0.0)),
         surface_in_space("surface", height, 0.5, (0.0, 0.0)),
     ]
-    write_report(
-        tmp_path / "product",
+    page = Page(
         title="A product with a very long name that has to break somewhere_" + "x" * 60,
         lead="A lead paragraph.",
-        headlines=[Comparison("Size", "90 x 120 cells", "of 0.5 mm")],
+        headlines=[Headline("Size", "90 x 120 cells", "of 0.5 mm")],
         tables=[Table("Wide", [f"column {i}" for i in range(12)], [["0.123456"] * 12] * 3)],
         figures=figures,
         settings={"a": 1},
         provenance={"scans/a": "sha256 " + "f" * 64},
     )
+    write_report(page, tmp_path / "product")
     return tmp_path
 
 
@@ -87,7 +87,7 @@ def swept(tmp_path_factory) -> Path:
 
 
 def open_page(chromium: str, page: Path, width: int, *flags: str) -> tuple[dict, str, dict]:
-    """What the probe found, the browser's log and its record of network traffic."""
+    """Results of the probe, the browser's log and its record of network traffic."""
     probed = page.with_name("probed.html")
     probed.write_text(page.read_text(encoding="utf-8").replace("</body>", PROBE + "</body>"), encoding="utf-8")
     home = page.parent / f"home_{width}{''.join(flags).count('dark')}"
@@ -102,8 +102,8 @@ def open_page(chromium: str, page: Path, width: int, *flags: str) -> tuple[dict,
     return found, done.stderr, json.loads(Path(f"{home}.json").read_text(encoding="utf-8"))
 
 
-def asked_for(record: dict) -> list[str]:
-    """Addresses that the page asked for and that are no files and no data; the browser's own have no origin."""
+def requested_addresses(record: dict) -> list[str]:
+    """Addresses that the page requested, without files and data; the browser's own requests have no origin."""
     names = {value: name for name, value in record["constants"]["logEventTypes"].items()}
     requests = [
         event["params"]
@@ -133,10 +133,10 @@ def test_a_study_and_a_sweep_open_from_disk(name, width, swept, chromium):
 
 
 def check_page(chromium: str, page: Path, width: int, *flags: str) -> dict:
-    """Open a page, check what holds for every report, and return what the probe found."""
+    """Open a page, check what every report must satisfy, and return the results of the probe."""
     found, log, record = open_page(chromium, page, width, *flags)
     assert "CONSOLE" not in log
-    assert asked_for(record) == []
+    assert requested_addresses(record) == []
     assert [name for name in found["resources"] if not name.startswith("data:")] == []
     assert found["broken"] == 0
     assert found["zoomed"]
@@ -150,7 +150,7 @@ def test_the_checks_see_a_request_and_an_error(tmp_path, chromium):
     body = '<body><figure><img src="http://127.0.0.1:9/a.png"></figure><script>console.error("spam")</script></body>'
     page.write_text(f"<!doctype html><html>{body}</html>", encoding="utf-8")
     found, log, record = open_page(chromium, page, 800)
-    assert asked_for(record) == ["http://127.0.0.1:9/a.png"]
+    assert requested_addresses(record) == ["http://127.0.0.1:9/a.png"]
     assert found["resources"] == ["http://127.0.0.1:9/a.png"]
     assert found["broken"] == 1
     assert "CONSOLE" in log

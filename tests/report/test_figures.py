@@ -1,10 +1,11 @@
-"""Figures: each has a title, a caption and axes with units, and shows the values it was given."""
+"""Figures: each has a title, a caption and axes with units, and shows the values it is made from."""
 
 import pytest
 import torch
 from mpl_toolkits.mplot3d import Axes3D
 
 from lsvision.report.calibration_figures import (
+    BoardView,
     components_by_iteration,
     corner_positions,
     corners_in_board_frame,
@@ -15,7 +16,7 @@ from lsvision.report.calibration_figures import (
 )
 from lsvision.report.drawing import new_figure, show_image, thinned
 from lsvision.report.embedding import embed
-from lsvision.report.product_figures import height_profile, product_images, sheet_correspondences
+from lsvision.report.product_figures import SheetView, height_profile, product_images, sheet_correspondences
 from lsvision.report.space_figures import corners_in_space, surface_in_space
 
 # Counts and directions have no unit.
@@ -37,17 +38,17 @@ def figures(determined, dominated, corners):
         observability_bars(determined),
         observability_bars(dominated, name="other", label="two-step"),
         corner_positions(corners, determined, label="first"),
-        corners_on_images((image, points), (image, points), 0.07),
+        corners_on_images(BoardView(image, points), BoardView(image, points), 0.07),
         product_images("product", "Colour and height", image, height, 0.5, (10.0, -20.0)),
         height_profile("profile", "Profile", height, 0.5, -20.0),
         corners_in_space([corners, corners], determined),
         surface_in_space("surface", height, 0.5, (10.0, -20.0)),
         surface_in_space("nothing", torch.full((4, 5), torch.nan), 0.5, (10.0, -20.0)),
-        sheet_correspondences((points, moved), (points, points), (image, image), 0.5),
+        sheet_correspondences(SheetView(image, points, moved), SheetView(image, points, points), 0.5),
     ]
 
 
-def test_every_figure_says_what_it_shows(figures):
+def test_every_figure_has_a_title_a_caption_and_units(figures):
     assert len({figure.name for figure in figures}) == len(figures)
     for item in figures:
         assert item.title
@@ -65,7 +66,7 @@ def test_every_figure_says_what_it_shows(figures):
                 assert unit or label.startswith(UNITLESS) or (label == "" and shares_y), (item.name, label)
 
 
-def test_curves_hold_the_iterations(determined):
+def test_curves_show_the_iterations(determined):
     (axes,) = rmse_by_iteration({"joint": determined}).figure.axes
     assert axes.lines[0].get_ydata().tolist() == [2.0, 0.5]
     panels = components_by_iteration({"joint": determined}).figure.axes

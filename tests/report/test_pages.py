@@ -1,4 +1,4 @@
-"""The report: one HTML file that asks for nothing else, its text escaped, its figures beside it."""
+"""The report: one HTML file that loads nothing else, its text escaped, its figures beside it."""
 
 import base64
 import dataclasses
@@ -9,15 +9,15 @@ import pytest
 import torch
 
 from lsvision.io import ProductLayout, ProductWriter, read_product
-from lsvision.report import Comparison, ReportFigure, Table, calibration_report, product_report, write_report
+from lsvision.report import Headline, Page, ReportFigure, Table, calibration_report, product_report, write_report
 from lsvision.report.drawing import label_axes, new_figure
 from lsvision.types import Provenance
 
 NASTY = "<script>alert('x')</script> & \"quotes\""
 
 
-class Page(HTMLParser):
-    """Collects what a page refers to and what it says."""
+class ReadPage(HTMLParser):
+    """Collects the references, tags and text of a page."""
 
     def __init__(self, text: str) -> None:
         super().__init__()
@@ -35,13 +35,13 @@ class Page(HTMLParser):
         self.text += data
 
 
-def read_page(folder: Path) -> Page:
+def read_page(folder: Path) -> ReadPage:
     source = (folder / "report.html").read_text(encoding="utf-8")
     assert "http:" not in source
     assert "https:" not in source
     assert "@import" not in source
     assert "url(" not in source
-    page = Page(source)
+    page = ReadPage(source)
     assert all(reference.startswith("data:") for reference in page.references)
     return page
 
@@ -55,18 +55,18 @@ def figure() -> ReportFigure:
 
 
 def test_report_is_complete_and_escaped(tmp_path, figure):
-    write_report(
-        tmp_path,
+    page = Page(
         title=f"title {NASTY}",
         lead=f"lead {NASTY}",
-        headlines=[Comparison("RMSE", f"1 {NASTY}", "before: 2 mm")],
+        headlines=[Headline("RMSE", f"1 {NASTY}", "before: 2 mm")],
         tables=[Table("Boards", ("scan", "σ [mm]"), [(NASTY, "0.5"), ("Tür", "0.1")], note="a note")],
         figures=[figure],
         settings={"scan": NASTY, "nested": {"list": [1, 2]}, "path": None},
         provenance={"scans/a": f"sha256 {NASTY}"},
     )
+    write_report(page, tmp_path)
     page = read_page(tmp_path)
-    assert page.tags.count("script") == 1  # the page's own
+    assert page.tags.count("script") == 1  # that of the template
     for piece in (f"title {NASTY}", f"lead {NASTY}", f"1 {NASTY}", f"caption {NASTY}", "σ [mm]", "Tür", "a note"):
         assert piece in page.text
     assert f"sha256 {NASTY}" in page.text
@@ -79,16 +79,16 @@ def test_report_is_complete_and_escaped(tmp_path, figure):
     assert base64.b64decode(picture.split(",", 1)[1]) == svg.read_bytes()
 
 
-def test_rows_lead_to_pages_beside_it(tmp_path):
+def test_rows_link_to_pages_beside_the_report(tmp_path):
     table = Table("Jobs", ("job", "n"), [("0", "1"), (NASTY, "2")], links=["0/report.html", "1/report.html"])
-    write_report(tmp_path, title="t", lead="l", headlines=[], tables=[table], figures=[], settings={})
-    page = Page((tmp_path / "report.html").read_text(encoding="utf-8"))
+    write_report(Page(title="t", lead="l", headlines=[], tables=[table]), tmp_path)
+    page = ReadPage((tmp_path / "report.html").read_text(encoding="utf-8"))
     assert page.references[1:] == ["0/report.html", "1/report.html"]
     assert NASTY in page.text
 
 
 def test_report_without_figures_or_tables(tmp_path):
-    write_report(tmp_path, title="t", lead="l", headlines=[], tables=[], figures=[], settings={})
+    write_report(Page(title="t", lead="l", headlines=[]), tmp_path)
     page = read_page(tmp_path)
     assert "img" not in page.tags
     assert page.tags.count("table") == 1  # what it was made from

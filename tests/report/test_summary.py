@@ -1,4 +1,4 @@
-"""A calibration in words."""
+"""A calibration summarised in words."""
 
 import dataclasses
 

@@ -1,9 +1,10 @@
-"""A small rig and what most scans share."""
+"""Rigs, a board, a motion and a sensor for most scans."""
 
 import pytest
 import torch
 
-from lsvision.simulation import MotionConfig, SensorConfig, scaled_rig
+from lsvision.geometry import scaled_rig
+from lsvision.simulation import MotionConfig, SensorConfig
 from lsvision.types import Board, Rig
 
 

@@ -1,4 +1,4 @@
-"""Where the corners of a checkerboard lie in an image, by fitting an analytic corner to each window."""
+"""Positions of the corners of a checkerboard in an image, by a fit of an analytic corner to each window."""
 
 import torch
 from torch import Tensor

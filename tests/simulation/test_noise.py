@@ -1,4 +1,4 @@
-"""Hashed value noise: the same wherever it is evaluated, of known moments, smooth between nodes."""
+"""Hashed value noise: independent of the piece evaluated, of known moments, smooth between nodes."""
 
 import torch
 

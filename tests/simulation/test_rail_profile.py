@@ -1,4 +1,4 @@
-"""The head of 60E1 and which of its points a ray meets first."""
+"""The head of the rail 60E1 and the point that a ray meets first."""
 
 import math
 

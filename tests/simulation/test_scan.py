@@ -7,8 +7,16 @@ import pytest
 import torch
 
 from lsvision.errors import ConfigError
-from lsvision.geometry import line_at, travel_at, triangulate
-from lsvision.simulation import EncoderConfig, MotionConfig, SceneConfig, SensorConfig, artwork, scaled_rig, simulate
+from lsvision.geometry import line_at, scaled_rig, travel_at, triangulate
+from lsvision.simulation import (
+    Acquisition,
+    EncoderConfig,
+    MotionConfig,
+    SceneConfig,
+    SensorConfig,
+    artwork,
+    simulate,
+)
 from lsvision.types import Rig
 from tests.simulation.corner_fit import fit_corners
 
@@ -29,7 +37,7 @@ def _kind(scene):
 
 @pytest.mark.parametrize("scene", SCENES, ids=_kind)
 def test_strips_of_any_height_hold_the_same_bits(coarse, board, motion, scene):
-    simulation = simulate(coarse, board, scene, motion, SensorConfig(), PITCH, lines=150)
+    simulation = simulate(coarse, board, scene, motion, SensorConfig(), Acquisition(PITCH, lines=150))
     for camera in ("left", "right"):
         whole = torch.cat(list(simulation.strips(camera, 150)))
         assert whole.shape == (150, coarse.width_px, 3)
@@ -44,17 +52,17 @@ def test_strips_of_any_height_hold_the_same_bits(coarse, board, motion, scene):
 
 @pytest.mark.parametrize("scene", SCENES, ids=_kind)
 def test_blocks_meet_without_a_seam(coarse, board, motion, clean, whole, scene, monkeypatch):
-    simulation = simulate(coarse, board, scene, motion, clean, PITCH, lines=96)
+    simulation = simulate(coarse, board, scene, motion, clean, Acquisition(PITCH, lines=96))
     by_default = whole(simulation)
     monkeypatch.setattr("lsvision.simulation.scan._BLOCK", 48)
     assert (whole(simulation) - by_default).abs().max() < 0.05 * 257  # a twentieth of a grey value of 255
 
 
 def test_seeds_change_only_what_they_name(coarse, board, motion, whole):
-    base = simulate(coarse, board, SceneConfig(), motion, SensorConfig(), PITCH, lines=64)
-    again = simulate(coarse, board, SceneConfig(), motion, SensorConfig(), PITCH, lines=64)
-    noise = simulate(coarse, board, SceneConfig(), motion, SensorConfig(seed=1), PITCH, lines=64)
-    texture = simulate(coarse, board, SceneConfig(seed=1), motion, SensorConfig(), PITCH, lines=64)
+    base = simulate(coarse, board, SceneConfig(), motion, SensorConfig(), Acquisition(PITCH, lines=64))
+    again = simulate(coarse, board, SceneConfig(), motion, SensorConfig(), Acquisition(PITCH, lines=64))
+    noise = simulate(coarse, board, SceneConfig(), motion, SensorConfig(seed=1), Acquisition(PITCH, lines=64))
+    texture = simulate(coarse, board, SceneConfig(seed=1), motion, SensorConfig(), Acquisition(PITCH, lines=64))
     assert torch.equal(whole(base), whole(again))
     difference = whole(base) - whole(noise)
     assert abs(difference.std() - 2**0.5 * 1.5) < 0.1  # of two draws of the default noise, quantised
@@ -67,9 +75,9 @@ def test_seeds_change_only_what_they_name(coarse, board, motion, whole):
 @pytest.mark.parametrize("scene", SCENES[:2], ids=_kind)
 def test_reverse_transport_turns_the_image_upside_down(coarse, board, clean, motion, whole, scene):
     scene = dataclasses.replace(scene, conveyor_drop_mm=40.0)
-    forward = simulate(coarse, board, scene, motion, clean, PITCH)
-    reverse = simulate(coarse, board, scene, motion, clean, PITCH, transport="reverse")
-    # Inside the target: the conveyor, which has no place of its own, shows other parts of its texture.
+    forward = simulate(coarse, board, scene, motion, clean, Acquisition(PITCH))
+    reverse = simulate(coarse, board, scene, motion, clean, Acquisition(PITCH, transport="reverse"))
+    # Inside the target: the endless conveyor shows other parts of its texture.
     covered = torch.cat(list(forward.depth_strips())) < coarse.zero_disparity_mm + scene.conveyor_drop_mm - 3.0
     inside = -torch.nn.functional.max_pool2d(-covered[None].float(), 9, 1, 4)[0] > 0
     assert inside.sum() > 30_000
@@ -82,7 +90,7 @@ def test_reverse_transport_turns_the_image_upside_down(coarse, board, clean, mot
 
 def test_depth_agrees_with_triangulated_corners(coarse, board, clean):
     motion = MotionConfig(-1.5, 0.8, 1.0246, vibration_z_mm=0.4, vibration_x_mm=0.4, vibration_roll_deg=0.1)
-    simulation = simulate(coarse, board, SceneConfig(pitch_deg=8.0, yaw_deg=30.0), motion, clean, PITCH)
+    simulation = simulate(coarse, board, SceneConfig(pitch_deg=8.0, yaw_deg=30.0), motion, clean, Acquisition(PITCH))
     left, right = simulation.corners()
     _, z = triangulate(coarse, left[:, 0], left[:, 0] - right[:, 0])
     depth = torch.cat(list(simulation.depth_strips()))
@@ -97,7 +105,9 @@ def test_depth_agrees_with_triangulated_corners(coarse, board, clean):
 def test_rail_depth_is_its_profile_along_the_motion(coarse, board, clean):
     scene = SceneConfig("rail", defect_spacing_mm=0.0, roll_mark_period_mm=0.0)
     depth = torch.cat(
-        list(simulate(coarse, board, scene, MotionConfig(1.0, -2.0), clean, PITCH, lines=90).depth_strips())
+        list(
+            simulate(coarse, board, scene, MotionConfig(1.0, -2.0), clean, Acquisition(PITCH, lines=90)).depth_strips()
+        )
     )
     torch.testing.assert_close(depth[70], depth[5], rtol=0, atol=2e-3)  # nothing changes along a sound, still rail
     crown = coarse.zero_disparity_mm - scene.rail_rise_mm
@@ -105,14 +115,16 @@ def test_rail_depth_is_its_profile_along_the_motion(coarse, board, clean):
     assert (depth.max() - depth.min()) < 52.0
     faulty = dataclasses.replace(scene, defect_spacing_mm=60.0)
     deeper = torch.cat(
-        list(simulate(coarse, board, faulty, MotionConfig(1.0, -2.0), clean, PITCH, lines=90).depth_strips())
+        list(
+            simulate(coarse, board, faulty, MotionConfig(1.0, -2.0), clean, Acquisition(PITCH, lines=90)).depth_strips()
+        )
     )
     assert 0.2 < (deeper - depth).max() < 1.2
     assert (deeper - depth).min() > -1e-3
 
 
 def _color_shifts(simulation, whole, board):
-    """How far, in columns and lines, each colour's corners lie from the model of the middle colour; (3, corners, 2)."""
+    """Shift, in columns and lines, of each colour's corners from the model of the middle one; (3, corners, 2)."""
     image, truth = whole(simulation), simulation.corners()[0]
     spacing = simulation.rig.color_spacing_lines
     late = 0.0 if simulation.sensor.color_registered else -simulation.trajectory.sign
@@ -127,9 +139,9 @@ def test_colours_lie_where_their_sensor_lines_look(small_rig, board, clean, whol
     rig = dataclasses.replace(small_rig, color_spacing_lines=(-4.0, 0.0, 4.0))
     sensor = dataclasses.replace(clean, color_registered=registered)
     scene, motion = SceneConfig(board_texture=0.0), MotionConfig(stretch=stretch)
-    simulation = simulate(rig, board, scene, motion, sensor, 0.56, transport=transport)
+    simulation = simulate(rig, board, scene, motion, sensor, Acquisition(0.56, transport=transport))
     shift = _color_shifts(simulation, whole, board)
-    # Colour s sees a point when it is still s / stretch lines short of the plane Y = 0; the camera puts back s lines.
+    # Colour s sees a point when it is still s / stretch lines short of the plane Y = 0; the camera shifts by s lines.
     per_line = simulation.trajectory.sign * (registered - 1.0 / stretch)
     expected = torch.zeros_like(shift)
     expected[..., 1] = per_line * torch.tensor(rig.color_spacing_lines)[:, None]
@@ -139,10 +151,10 @@ def test_colours_lie_where_their_sensor_lines_look(small_rig, board, clean, whol
 def test_sheet_shows_its_artwork(small_rig, board, whole):
     sensor = SensorConfig(noise=0.0, blur_px=0.0, bits=16)
     scene = SceneConfig("sheet", yaw_deg=8.0)
-    simulation = simulate(small_rig, board, scene, MotionConfig(), sensor, 0.56)
+    simulation = simulate(small_rig, board, scene, MotionConfig(), sensor, Acquisition(0.56))
     points = torch.rand(4000, 2) * torch.tensor([300.0, 220.0]) + 30.0
     in_space = torch.cat([points, torch.zeros(4000, 1)], -1).double() @ simulation.pose.rotation.mT
-    x, line, z = simulation.trajectory.project(in_space + simulation.pose.translation)
+    x, line, z = simulation.trajectory.project(in_space + simulation.pose.translation).unbind(-1)
     u = x / z * small_rig.focal_length_px + small_rig.principal_left_px
     image = whole(simulation)
     grid = 2 * torch.stack([u, line], -1) / (u.new_tensor([small_rig.width_px, simulation.lines]) - 1) - 1
@@ -155,7 +167,7 @@ def test_sheet_shows_its_artwork(small_rig, board, whole):
 
 def test_encoder_log_follows_the_true_positions(coarse, board, clean):
     encoder = EncoderConfig(enabled=True, wobble_mm=0.5, noise_mm=0.01)
-    simulation = simulate(coarse, board, SceneConfig(), MotionConfig(), clean, PITCH, encoder=encoder)
+    simulation = simulate(coarse, board, SceneConfig(), MotionConfig(), clean, Acquisition(PITCH, encoder=encoder))
     line = torch.arange(simulation.lines, dtype=torch.float64)
     error = travel_at(simulation.travel, line) - simulation.trajectory.position(line)
     assert abs(error.std() - 0.01) < 0.002
@@ -166,20 +178,20 @@ def test_encoder_log_follows_the_true_positions(coarse, board, clean):
 
 
 def test_truth_is_plain_and_complete(coarse, board, motion, clean):
-    simulation = simulate(coarse, board, SceneConfig(), motion, clean, PITCH)
+    simulation = simulate(coarse, board, SceneConfig(), motion, clean, Acquisition(PITCH))
     truth = json.loads(json.dumps(simulation.truth()))
     assert {"n", "stretch", "R", "T", "lines", "args", "corners_left_px", "corners_right_px"} == truth.keys()
     assert torch.tensor(truth["corners_left_px"]).shape == (88, 2)
     points = torch.tensor(truth["corners_left_px"])
     assert (points > 0).all()
     assert (points < torch.tensor([coarse.width_px, truth["lines"]])).all()
-    rail = simulate(coarse, board, SceneConfig("rail"), motion, clean, PITCH).truth()
+    rail = simulate(coarse, board, SceneConfig("rail"), motion, clean, Acquisition(PITCH)).truth()
     assert "corners_left_px" not in rail
 
 
 @pytest.mark.parametrize("yaw", [0.0, 40.0, 95.0])
 def test_target_lies_in_both_views(coarse, board, motion, clean, yaw):
-    simulation = simulate(coarse, board, SceneConfig(yaw_deg=yaw, pitch_deg=9.0), motion, clean, PITCH)
+    simulation = simulate(coarse, board, SceneConfig(yaw_deg=yaw, pitch_deg=9.0), motion, clean, Acquisition(PITCH))
     for corners in simulation.corners():
         assert (corners > 2).all()
         assert (corners < torch.tensor([coarse.width_px, simulation.lines]) - 3).all()
@@ -188,7 +200,9 @@ def test_target_lies_in_both_views(coarse, board, motion, clean, yaw):
 @pytest.mark.parametrize("scene", SCENES, ids=_kind)
 def test_images_are_neither_black_nor_flat_nor_burnt(coarse, board, motion, scene):
     for camera in ("left", "right"):
-        image = torch.cat(list(simulate(coarse, board, scene, motion, SensorConfig(), PITCH).strips(camera))).float()
+        image = torch.cat(
+            list(simulate(coarse, board, scene, motion, SensorConfig(), Acquisition(PITCH)).strips(camera))
+        ).float()
         assert 25 < image.mean() < 180
         assert image.std() > 20
         assert (image == 255).float().mean() < 0.002
@@ -199,25 +213,13 @@ def test_images_are_neither_black_nor_flat_nor_burnt(coarse, board, motion, scen
 
 def test_mono_and_16_bits(coarse, board, motion, whole):
     scene, sensor = SceneConfig(), SensorConfig(noise=0.0)
-    color = whole(simulate(coarse, board, scene, motion, sensor, PITCH, lines=40))
-    mono = simulate(coarse, board, scene, motion, dataclasses.replace(sensor, mono=True), PITCH, lines=40)
-    deep = simulate(coarse, board, scene, motion, dataclasses.replace(sensor, bits=16), PITCH, lines=40)
+    color = whole(simulate(coarse, board, scene, motion, sensor, Acquisition(PITCH, lines=40)))
+    mono = simulate(coarse, board, scene, motion, dataclasses.replace(sensor, mono=True), Acquisition(PITCH, lines=40))
+    deep = simulate(coarse, board, scene, motion, dataclasses.replace(sensor, bits=16), Acquisition(PITCH, lines=40))
     assert (mono.channels, deep.channels) == (1, 3)
     assert (whole(mono)[..., 0] - color.mean(-1)).abs().max() <= 1.0
     assert next(deep.strips("left")).dtype == torch.uint16
     assert (whole(deep) / 257 - color).abs().max() <= 0.51
-
-
-def test_scaled_rig_keeps_the_field_and_its_edge(full_rig):
-    rig = scaled_rig(full_rig, 4)
-    assert rig.width_px == 1786
-    torch.testing.assert_close(
-        [rig.pixel_pitch_um, rig.principal_left_px, rig.principal_right_px, rig.zero_disparity_mm],
-        [40.0, 260.125, 1524.375, full_rig.zero_disparity_mm],
-    )
-    assert scaled_rig(full_rig, 1) == full_rig
-    with pytest.raises(ValueError, match="scale"):
-        scaled_rig(full_rig, 0.5)
 
 
 @pytest.mark.parametrize(
@@ -231,17 +233,22 @@ def test_scaled_rig_keeps_the_field_and_its_edge(full_rig):
         ({"sensor": SensorConfig(blur_px=-1.0)}, r"sensor\.blur_px"),
         ({"motion": MotionConfig(stretch=0.0)}, r"motion\.stretch"),
         ({"motion": MotionConfig(vibration_wavelengths_mm=[])}, "vibration_wavelengths_mm"),
-        ({"line_pitch_mm": float("nan")}, "line_pitch_mm"),
-        ({"lines": 0}, "lines"),
-        ({"encoder": EncoderConfig(True, wobble_mm=60.0)}, r"encoder\.wobble_mm"),
+        ({"acquisition": Acquisition(float("nan"))}, "line_pitch_mm"),
+        ({"acquisition": Acquisition(PITCH, lines=0)}, "lines"),
+        ({"acquisition": Acquisition(PITCH, encoder=EncoderConfig(True, wobble_mm=60.0))}, r"encoder\.wobble_mm"),
     ],
 )
 def test_bad_settings_are_named(coarse, board, change, message):
-    settings = {"scene": SceneConfig(), "motion": MotionConfig(), "sensor": SensorConfig(), "line_pitch_mm": PITCH}
+    settings = {
+        "scene": SceneConfig(),
+        "motion": MotionConfig(),
+        "sensor": SensorConfig(),
+        "acquisition": Acquisition(PITCH),
+    }
     with pytest.raises(ConfigError, match=message):
         simulate(coarse, board, **(settings | change))
 
 
 def test_strip_height_must_be_positive(coarse, board, motion):
     with pytest.raises(ValueError, match="strip_lines"):
-        simulate(coarse, board, SceneConfig(), motion, SensorConfig(), PITCH).strips("left", 0)
+        simulate(coarse, board, SceneConfig(), motion, SensorConfig(), Acquisition(PITCH)).strips("left", 0)

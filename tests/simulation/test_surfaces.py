@@ -73,19 +73,19 @@ def test_light_is_one_in_the_middle_symmetric_and_falls_off(small_rig):
 
 def test_defects_are_the_same_in_any_piece_and_return_with_the_roll():
     scene = SceneConfig("rail", defect_spacing_mm=80.0, roll_mark_period_mm=50.0)
-    whole_depth, whole_factor = defects(scene, Nodes(-80, 0, 160, 1000, 0.4), 3)
-    depth, factor = defects(scene, Nodes(-20, 300, 60, 200, 0.4), 3)
-    torch.testing.assert_close(depth, whole_depth[300:500, 60:120])
-    torch.testing.assert_close(factor, whole_factor[300:500, 60:120])
+    whole = defects(scene, Nodes(-80, 0, 160, 1000, 0.4), 3)
+    piece = defects(scene, Nodes(-20, 300, 60, 200, 0.4), 3)
+    torch.testing.assert_close(piece.depth_mm, whole.depth_mm[300:500, 60:120])
+    torch.testing.assert_close(piece.factor, whole.factor[300:500, 60:120])
     marks = SceneConfig("rail", defect_spacing_mm=0.0, roll_mark_period_mm=50.0)
-    depth, factor = defects(marks, Nodes(-80, 0, 160, 1000, 0.4), 3)
-    torch.testing.assert_close(depth[:250], depth[250:500])
-    assert 0.3 < depth.max() < 0.5
-    assert factor.min() > 0
+    relief = defects(marks, Nodes(-80, 0, 160, 1000, 0.4), 3)
+    torch.testing.assert_close(relief.depth_mm[:250], relief.depth_mm[250:500])
+    assert 0.3 < relief.depth_mm.max() < 0.5
+    assert relief.factor.min() > 0
     sound = SceneConfig("rail", defect_spacing_mm=0.0, roll_mark_period_mm=0.0)
-    depth, factor = defects(sound, Nodes(0, 0, 4, 4, 0.4), 0)
-    assert (depth == 0).all()
-    assert (factor == 1).all()
+    relief = defects(sound, Nodes(0, 0, 4, 4, 0.4), 0)
+    assert (relief.depth_mm == 0).all()
+    assert (relief.factor == 1).all()
 
 
 def test_samples_tile_their_pixels():
@@ -102,11 +102,11 @@ def test_integration_keeps_light_and_has_the_variance_of_box_and_blur(blur_px):
     torch.testing.assert_close(flat, torch.full((3, 15, 15), 0.7))
     samples = torch.zeros(1, count * 5, count * 5)
     samples[0, (count // 2) * 5 + 2, (count // 2) * 5 + 2] = 1.0
-    spread = integrate(samples, sensor)[0]
-    profile = spread.sum(0) / spread.sum()
+    blurred = integrate(samples, sensor)[0]
+    profile = blurred.sum(0) / blurred.sum()
     shift = torch.arange(15.0) - 7
     torch.testing.assert_close((profile * shift).sum(), torch.tensor(0.0), rtol=0, atol=1e-5)
-    # Summed over pixels a centred point spreads by the blur alone, up to what sampling at pixels adds to a box.
+    # Summed over pixels, the variance of a centred point is that of the blur, plus what the sampling of a box adds.
     assert (profile * shift**2).sum() == pytest.approx(blur_px**2 + (blur_px > 0) / 12, abs=0.1)
 
 

@@ -47,7 +47,7 @@ def test_still_motion_is_equation_11(small_rig):
     measured = torch.tensor([[20.0, 100.0, 800.0]], dtype=torch.float64)  # x, line, z
     n = trajectory.n
     point = torch.tensor([[20.0, 0.0, 800.0]], dtype=torch.float64) + 56.0 * n
-    torch.testing.assert_close(torch.stack(trajectory.project(point), -1), measured, rtol=0, atol=1e-10)
+    torch.testing.assert_close(trajectory.project(point), measured, rtol=0, atol=1e-10)
 
 
 @pytest.mark.parametrize("transport", ["forward", "reverse"])
@@ -55,7 +55,7 @@ def test_still_motion_is_equation_11(small_rig):
 def test_rays_pass_through_the_points_that_project_onto_them(trajectory, small_rig, camera, transport):
     trajectory = dataclasses.replace(trajectory, transport=transport)
     points = torch.randn(60, 3, dtype=torch.float64) * 30 + torch.tensor([170.0, 120.0, 790.0])
-    x, line, z = trajectory.project(points)
+    x, line, z = trajectory.project(points).unbind(-1)
     columns = project(small_rig, x, z)[camera == "right"]
     rays = cast_rays(trajectory, camera, columns, line)
     seen = rays.origin + z[:, None] * (rays.slope.double()[:, None] * rays.across + rays.ahead)
@@ -63,10 +63,10 @@ def test_rays_pass_through_the_points_that_project_onto_them(trajectory, small_r
 
 
 def test_displacement_adds_to_what_the_cameras_see(small_rig):
-    """A point on the axis of roll is seen where it would be, moved by (dx, dz)."""
+    """A point on the axis of roll is seen shifted by (dx, dz)."""
     trajectory = Trajectory(small_rig, SHAKEN, EncoderConfig(), 0.56)
     y = torch.tensor([80.0], dtype=torch.float64)
-    x, line, z = trajectory.project(trajectory.pivot + y[:, None] * trajectory.n)
+    x, line, z = trajectory.project(trajectory.pivot + y[:, None] * trajectory.n).unbind(-1)
     dx, dz, _ = trajectory.vibration(line).unbind(-1)
     torch.testing.assert_close(torch.stack([x, z]), trajectory.pivot[[0, 2], None] + torch.stack([dx, dz]))
 
@@ -76,7 +76,7 @@ def test_roll_turns_from_x_towards_negative_z_seen_with_y_into_the_page(small_ri
     trajectory = Trajectory(small_rig, motion, EncoderConfig(), 0.56)
     y = torch.tensor([80.0], dtype=torch.float64)
     beside = trajectory.pivot + torch.tensor([10.0, 0.0, 0.0]) + y[:, None] * trajectory.n
-    x, line, z = trajectory.project(beside)
+    x, line, z = trajectory.project(beside).unbind(-1)
     roll = trajectory.vibration(line)[:, 2]
     torch.testing.assert_close(x - trajectory.pivot[0], 10 * torch.cos(roll))
     torch.testing.assert_close(z - trajectory.pivot[2], -10 * torch.sin(roll))

@@ -5,8 +5,16 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from lsvision.geometry import scan_position, transform
-from lsvision.simulation import EncoderConfig, MotionConfig, SceneConfig, SensorConfig, Simulation, scaled_rig, simulate
+from lsvision.geometry import scaled_rig, scan_position, transform
+from lsvision.simulation import (
+    Acquisition,
+    EncoderConfig,
+    MotionConfig,
+    SceneConfig,
+    SensorConfig,
+    Simulation,
+    simulate,
+)
 from lsvision.types import Board, DepthView, Rig, Scan, StereoPair, TensorImage, Transport
 
 FULL_RIG = Rig(7142, 10.0, 113.84, 354.0, 1042.0, 6099.0)
@@ -22,7 +30,9 @@ def simulation(
     scene: SceneConfig = TILTED, transport: Transport = "forward", encoder: EncoderConfig | None = None
 ) -> Simulation:
     """A board or sheet under the small rig, in motion."""
-    return simulate(SMALL_RIG, BOARD, scene, MOTION, FINE_SENSOR, PITCH, transport=transport, encoder=encoder)
+    return simulate(
+        SMALL_RIG, BOARD, scene, MOTION, FINE_SENSOR, Acquisition(PITCH, transport=transport, encoder=encoder)
+    )
 
 
 def stereo_scan(source: Simulation) -> Scan:

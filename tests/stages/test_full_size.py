@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from lsvision.image.board.detect import detect_board
-from lsvision.simulation import MotionConfig, SceneConfig, SensorConfig, simulate
+from lsvision.simulation import Acquisition, MotionConfig, SceneConfig, SensorConfig, simulate
 from lsvision.stages.disparity.config import DisparityConfig
 from lsvision.stages.disparity.match import StripMatch, measure_strip
 from lsvision.types import TensorImage
@@ -19,7 +19,9 @@ PITCH = 0.07
 def test_corners_at_full_size(yaw):
     scene = SceneConfig("board", 2.0, 1.5, yaw, texture_mm=0.15, board_texture=0.0)
     motion = MotionConfig(angle_x_deg=3.0, stretch=1.0246)
-    source = simulate(FULL_RIG, BOARD, scene, motion, SensorConfig(noise=3.0, blur_px=1.0, supersampling=2), PITCH)
+    source = simulate(
+        FULL_RIG, BOARD, scene, motion, SensorConfig(noise=3.0, blur_px=1.0, supersampling=2), Acquisition(PITCH)
+    )
     detected = detect_board(TensorImage(torch.cat(list(source.strips("left")))), BOARD)
     assert detected is not None
     assert detected.valid.all()
@@ -40,8 +42,7 @@ def test_disparity_at_full_size(kind):
         SceneConfig(kind, texture_mm=0.15, **tilt),
         MotionConfig(angle_x_deg=-1.5, angle_z_deg=0.8, stretch=1.0246),
         SensorConfig(noise=2.0, supersampling=2),
-        PITCH,
-        lines=512,
+        Acquisition(PITCH, lines=512),
     )
     left, right = (torch.cat(list(source.strips(camera))) for camera in ("left", "right"))
     depth = torch.cat(list(source.depth_strips())).double()

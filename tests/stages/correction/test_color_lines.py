@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from lsvision.simulation import EncoderConfig, MotionConfig, SceneConfig, SensorConfig, simulate
+from lsvision.simulation import Acquisition, EncoderConfig, MotionConfig, SceneConfig, SensorConfig, simulate
 from lsvision.stages.correction.config import CorrectionConfig
 from lsvision.stages.correction.correct import correct_scan
 from lsvision.stages.disparity.depth import depth_of
@@ -27,7 +27,7 @@ def product(spacing: float, *, registered: bool, transport: str, encoder: Encode
     rig = dataclasses.replace(SMALL_RIG, color_spacing_lines=(-spacing, 0.0, spacing))
     sensor = SensorConfig(supersampling=2, noise=0.0, color_registered=registered)
     sheet = SceneConfig(kind="sheet", yaw_deg=3.0)
-    source = simulate(rig, BOARD, sheet, MOTION, sensor, PITCH, transport=transport, encoder=encoder)
+    source = simulate(rig, BOARD, sheet, MOTION, sensor, Acquisition(PITCH, transport=transport, encoder=encoder))
     scan = dataclasses.replace(depth_scan(source), color_registered=registered)
     if not corrected:
         scan = dataclasses.replace(scan, rig=SMALL_RIG)

@@ -9,8 +9,15 @@ import torch
 import torch.nn.functional as F  # noqa: N812
 from torch import Tensor
 
-from lsvision.geometry import ProductFrame
-from lsvision.simulation import EncoderConfig, MotionConfig, SceneConfig, SensorConfig, scaled_rig, simulate
+from lsvision.geometry import ProductFrame, scaled_rig
+from lsvision.simulation import (
+    Acquisition,
+    EncoderConfig,
+    MotionConfig,
+    SceneConfig,
+    SensorConfig,
+    simulate,
+)
 from lsvision.stages.correction.config import CorrectionConfig
 from lsvision.stages.correction.correct import correct_scan
 from lsvision.stages.correction.grid import plan_product
@@ -40,9 +47,7 @@ def rendered(kind: str, scale: float, stretch: float, lines: int, encoder: bool,
         scene,
         dataclasses.replace(ASKEW, stretch=stretch),
         SensorConfig(supersampling=2),
-        0.07 * scale,
-        lines=lines,
-        encoder=wobble,
+        Acquisition(0.07 * scale, lines=lines, encoder=wobble),
     )
     cameras = ("left", "right") if right else ("left",)
     images = [TensorImage(torch.cat(list(source.strips(camera)))) for camera in cameras]

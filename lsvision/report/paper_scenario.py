@@ -1,0 +1,96 @@
+"""Results of one scenario of the paper's experiment, and the paper's own numbers."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from lsvision.io import Product
+from lsvision.report.calibration_figures import BoardView
+from lsvision.simulation.sheet_points import SheetPoints
+from lsvision.types import BoardCorners, Calibration, Scan
+
+# Wang et al. 2024, section 5: RMSE before and after, its improvement, iterations and stretch.
+PAPER = {"rmse_before_mm": 2.059, "rmse_after_mm": 0.8794, "improvement": 0.573, "iterations": 5, "stretch": 1.0246}
+
+
+@dataclass(frozen=True)
+class BoardCheck:
+    """Rms errors of the distances between a board's corners, mm, as scanned and in the product.
+
+    Attributes:
+        corners: number of corners found in the product; 0 if it does not show the board.
+        neighbours_before_mm, neighbours_after_mm: errors between neighbouring corners.
+        pairs_before_mm, pairs_after_mm: errors between all pairs of corners.
+        points: corners in the product frame ``(corners, 3)``, mm.
+    """
+
+    corners: int
+    neighbours_before_mm: float
+    pairs_before_mm: float
+    neighbours_after_mm: float = math.nan
+    pairs_after_mm: float = math.nan
+    points: Tensor | None = None
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """Everything that one scenario produced, by name of the scan or of the method."""
+
+    n_true: Tensor
+    results: Mapping[str, Calibration]
+    boards: Mapping[str, BoardCorners]
+    checks: Mapping[str, BoardCheck]
+    sheet_before: SheetPoints
+    sheet_after: SheetPoints
+    scans: Mapping[str, Scan]
+    products: Mapping[str, Product]
+
+    def summary(self) -> dict:
+        """Plain values for ``summary.json``."""
+        methods = {method: self._method_summary(result) for method, result in self.results.items()}
+        products = {
+            "board_distance_rms_mm": {
+                name: {"corners": check.corners, "before": check.pairs_before_mm, "after": check.pairs_after_mm}
+                for name, check in self.checks.items()
+            },
+            "sheet_rms_mm": {"before": self.sheet_before.rms_mm, "after": self.sheet_after.rms_mm},
+            "sheet_shift_px": {
+                "rms": float(self.sheet_after.shift_px.square().mean().sqrt()),
+                "max": float(self.sheet_after.shift_px.max()),
+                "points": len(self.sheet_after.shift_px),
+            },
+        }
+        return {**methods, "products": products}
+
+    def image(self, name: str) -> Tensor:
+        """The whole left image of a scan."""
+        scan = self.scans[name]
+        return scan.left.read(0, scan.lines)
+
+    def scanned_board(self, name: str) -> BoardView:
+        """A board's scan with the corners found in it."""
+        return BoardView(self.image(name), self.boards[name].left_px)
+
+    def corrected_board(self, name: str) -> BoardView:
+        """A board's product with the corners found in it."""
+        product, points = self.products[name], self.checks[name].points
+        color = product.color(0, product.shape[0])
+        if points is None:
+            return BoardView(color, torch.empty(0, 2))
+        origin_y, origin_x = product.origin_mm
+        return BoardView(color, (points[:, :2] - torch.tensor([origin_x, origin_y])) / product.pitch_mm)
+
+    def _method_summary(self, result: Calibration) -> dict:
+        return {
+            "rmse_before_mm": result.rmse_before_mm,
+            "rmse_after_mm": result.rmse_after_mm,
+            "improvement": result.improvement,
+            "iterations": len(result.iterations) - 1,
+            "n": result.motion.n.tolist(),
+            "n_true": self.n_true.tolist(),
+            "sigma": result.motion.sigma.tolist(),
+            "verdict": result.observability.verdict,
+        }
