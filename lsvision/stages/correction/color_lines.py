@@ -6,7 +6,7 @@ green sees at (x, z) and travel y when the object has moved on by s / n2 of trav
 
 import math
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
@@ -19,6 +19,7 @@ _GREEN = 1
 _COARSE_FROM = 1.25  # distance of cells, in pixels, from which on smoothing does more good than harm
 
 
+@runtime_checkable
 class Sampling(Protocol):
     """How colours are interpolated."""
 
