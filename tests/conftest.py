@@ -8,7 +8,21 @@ import hypothesis
 import jaxtyping
 import pytest
 
-jaxtyping.install_import_hook(["lsvision.geometry", "lsvision.estimation", "lsvision.image"], "beartype.beartype")
+LIBRARY = Path(__file__).parents[1]
+# Not the options (config.py, study.points): the library itself reports a value of a wrong type there.
+STAGES = [
+    path for path in (LIBRARY / "lsvision" / "stages").rglob("*.py") if path.name not in ("config.py", "__init__.py")
+]
+jaxtyping.install_import_hook(
+    [
+        "lsvision.geometry",
+        "lsvision.estimation",
+        "lsvision.image",
+        *(f"lsvision.study.{name}" for name in ("map", "runs", "tables")),
+        *(".".join(path.relative_to(LIBRARY).with_suffix("").parts) for path in STAGES),
+    ],
+    "beartype.beartype",
+)
 
 import torch  # noqa: E402
 

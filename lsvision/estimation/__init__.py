@@ -1,26 +1,41 @@
-"""Estimation of Gaussian states: cubature regression, square-root filters, joint update, least squares, information."""
+"""Estimation of Gaussian states: cubature regression, square-root filters, joint update, least squares, information.
+
+The calibration uses ``iterated_update``, ``filter_sequence``, ``levenberg_marquardt``, ``slr`` and the information of a
+posterior. The rest is library API for other models, which the package itself does not call: ``measurement`` and
+``whitened_rows`` for the joint update, ``predict``, ``update`` and ``smooth`` for filters, ``recentre`` for rotations
+in a state, ``nis``, ``fisher_information`` and ``marginal_information`` for checks. ``linalg`` holds the matrix
+functions that all of them use, and the rule on bits.
+"""
 
 from lsvision.estimation.consistency import mean_chi_square_band, nees, nis
-from lsvision.estimation.cubature import slr
+from lsvision.estimation.cubature import AffineModel, slr
 from lsvision.estimation.derivative import jacobian
-from lsvision.estimation.filtering import Track, Update, filter_sequence, predict, update
+from lsvision.estimation.filtering import StateSpace, Track, Update, filter_sequence, predict, update
+from lsvision.estimation.gaussian import Gaussian, Prior
 from lsvision.estimation.information import (
+    Directions,
     cramer_rao_bound,
     fisher_information,
     marginal_information,
     weighed_directions,
 )
-from lsvision.estimation.joint import Info, Posterior, Rows, iterated_update, measurement, whitened_rows
+from lsvision.estimation.joint import Info, Linearise, Posterior, Rows, iterated_update, measurement, whitened_rows
 from lsvision.estimation.least_squares import LeastSquares, levenberg_marquardt
+from lsvision.estimation.linalg import apply, lower_factor, product, solve_upper, upper_root
 from lsvision.estimation.rotation import recentre
 from lsvision.estimation.smoothing import smooth
-from lsvision.estimation.triangular import apply, lower_factor, solve_upper, upper_root
 
 __all__ = [
+    "AffineModel",
+    "Directions",
+    "Gaussian",
     "Info",
     "LeastSquares",
+    "Linearise",
     "Posterior",
+    "Prior",
     "Rows",
+    "StateSpace",
     "Track",
     "Update",
     "apply",
@@ -37,6 +52,7 @@ __all__ = [
     "nees",
     "nis",
     "predict",
+    "product",
     "recentre",
     "slr",
     "smooth",

@@ -1,4 +1,4 @@
-"""Whether an estimator's errors are as large as it says: normalised squares against chi-square bands.
+"""Whether an estimator's errors are as large as its sigmas state: normalised squares against chi-square bands.
 
 Source: Bar-Shalom, Li & Kirubarajan 2001, sec. 5.4.
 """
@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from lsvision.estimation.triangular import lower_factor, solve_upper
+from lsvision.estimation.linalg import lower_factor, solve_upper
 
 
 def nees(
@@ -22,12 +22,12 @@ def nees(
 
 
 def nis(whitened_innovation: Float[Tensor, "*batch measurement"]) -> Float[Tensor, "*batch"]:
-    """Normalised innovation squared; on average the size of the measurement."""
+    """Library API: normalised innovation squared; on average the size of the measurement."""
     return whitened_innovation.square().sum(-1)
 
 
 def mean_chi_square_band(freedom: int, runs: int, probability: float = 0.95) -> tuple[float, float]:
-    """Bounds that the mean of ``runs`` chi-square values of ``freedom`` degrees keeps with a probability."""
+    """Interval that holds the mean of ``runs`` chi-square values of ``freedom`` degrees with a probability."""
     total = freedom * runs
     tail = (1 - probability) / 2
     return _chi_square_quantile(tail, total) / runs, _chi_square_quantile(1 - tail, total) / runs

@@ -10,8 +10,8 @@ from torch.func import jacfwd
 def jacobian(function: Callable[[Tensor], Tensor], at: Tensor) -> Tensor:
     """Derivative of a function at a point, ``(*values, *arguments)``.
 
-    torch loads its forward formulas at the first call and warns then of its own use of torch.jit, which says nothing to
-    our callers.
+    torch loads its forward formulas at the first call and then warns of torch.jit, which it uses itself; the caller
+    cannot act on that.
     """
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="`torch.jit.script", category=DeprecationWarning)

@@ -4,6 +4,7 @@ Source: Bar-Shalom, Li & Kirubarajan 2001, Estimation with Applications to Track
 """
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
@@ -15,11 +16,11 @@ from lsvision.estimation.derivative import jacobian
 def fisher_information(
     whitened_residual: Callable[[Tensor], Tensor], state: Float[Tensor, " state"]
 ) -> Float[Tensor, "state state"]:
-    """Information Jᵀ J of measurements on a state, J by forward differentiation.
+    """Library API: information Jᵀ J of measurements on a state, J by forward differentiation.
 
     Args:
-        whitened_residual: takes ``(state,)`` to measured less predicted values in standard deviations, any shape. What
-            is known before the measurements has no part in it.
+        whitened_residual: takes ``(state,)`` to measured less predicted values in sigmas, any shape. A prior has no
+            part in it.
     """
     J = jacobian(whitened_residual, state).flatten(0, -2)
     return J.mT @ J
@@ -28,7 +29,7 @@ def fisher_information(
 def marginal_information(
     information: Float[Tensor, "*batch state state"], keep: int
 ) -> Float[Tensor, "*batch keep keep"]:
-    """Information on the last ``keep`` components, all others unknown: the Schur complement.
+    """Library API: information on the last ``keep`` components, all others unknown, the Schur complement.
 
     Raises:
         torch.linalg.LinAlgError: the others are not determined even where the last are known.
@@ -47,16 +48,26 @@ def cramer_rao_bound(
     return scale[..., :, None] * torch.linalg.inv(balanced) * scale[..., None, :]
 
 
-def weighed_directions(
-    information: Float[Tensor, "*batch state state"], prior_sigma: float
-) -> tuple[Float[Tensor, "*batch state state"], Float[Tensor, "*batch state"]]:
+@dataclass(frozen=True)
+class Directions:
     """Directions in which data and an isotropic prior add up independently, the weakest first.
 
-    Returns:
-        Unit vectors as rows, their largest component positive, and along each the posterior sigma over the prior's: 1
-        where the data say nothing.
+    ``vectors`` are unit vectors as rows, their largest component positive; ``share`` is the posterior sigma over the
+    prior's along each, 1 where the data contribute nothing.
     """
+
+    vectors: Float[Tensor, "*batch state state"]
+    share: Float[Tensor, "*batch state"]
+
+    @property
+    def weakest(self) -> Float[Tensor, "*batch state"]:
+        """The direction that the data determine least."""
+        return self.vectors[..., 0, :]
+
+
+def weighed_directions(information: Float[Tensor, "*batch state state"], prior_sigma: float) -> Directions:
+    """How far data of a given information narrow an isotropic prior, direction by direction."""
     weight, columns = torch.linalg.eigh(information * prior_sigma**2)
     vectors = columns.mT
     largest = vectors.gather(-1, vectors.abs().argmax(-1, keepdim=True))
-    return vectors * largest.sign(), (1.0 + weight.clamp(min=0.0)).rsqrt()
+    return Directions(vectors * largest.sign(), (1.0 + weight.clamp(min=0.0)).rsqrt())

@@ -1,7 +1,7 @@
 """Joint update by many measurements at once: iterated posterior linearisation in square-root information form.
 
-Measurements reach the update as whitened rows ``[A | r]``: the state's increment dx from the present mean is to fulfil
-A dx = r up to unit noise. The linearisation's own error r ~ N(0, S Sᵀ), which all measurements share, enters as latent
+Measurements reach the update as whitened rows ``[A | r]``: A dx = r up to unit noise for the increment dx of the state
+from the present mean. The linearisation's error ~ N(0, S Sᵀ), which all measurements share, enters as latent
 unknowns with unit prior, eliminated by the same QR: no covariance between measurements is ever formed, and the cost is
 linear in their number. The prior is never replaced: only the point of linearisation moves, so data are counted once.
 
@@ -10,7 +10,7 @@ Source: García-Fernández, Svensson, Morelande & Särkkä 2015 (iteration); Rai
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntEnum
 
 import torch
@@ -18,16 +18,17 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from lsvision.estimation.cubature import Function, slr
-from lsvision.estimation.triangular import apply, lower_factor, solve_upper, upper_root
+from lsvision.estimation.gaussian import Gaussian, Prior
+from lsvision.estimation.linalg import apply, lower_factor, solve_upper, upper_root
 
-# A step may raise the cost (twice a negative log density) by this much before it is halved: less than the posterior's
-# own scatter, more than what separates the posterior's mean from its mode.
+# A step may raise the cost (twice a negative log density) by this much before it is halved: less than the cost varies
+# over the posterior itself, more than it differs between the posterior's mean and mode.
 _COST_SLACK = 1.0
 _HALVINGS = 8
 
 
 class Info(IntEnum):
-    """What became of one problem of a batch."""
+    """Status of one problem of a batch."""
 
     OK = 0
     NOT_CONVERGED = 1
@@ -68,7 +69,7 @@ def whitened_rows(
     noise_chol: Float[Tensor, "*batch blocks size size"],
     valid: Bool[Tensor, "*batch blocks"],
 ) -> Rows:
-    """Rows of the affine model ``residual = A dx + factor ξ + noise``, reduced to at most state + 1.
+    """Library API: rows of the model ``residual = A dx + factor ξ + noise``, reduced to at most state + 1.
 
     Args:
         A, residual: model about the present mean, in blocks of jointly noisy components.
@@ -94,119 +95,125 @@ def measurement(
     noise_chol: Callable[[Tensor], Tensor],
     valid: Bool[Tensor, "*batch blocks"],
 ) -> Linearise:
-    """Linearisation of any measurement function, for ``iterated_update``.
+    """Library API: linearisation of any measurement function, for ``iterated_update``.
 
     Args:
         h: takes ``(points, *batch, state)`` to ``(points, *batch, blocks, size)``.
-        measured: what was measured; NaN where ``valid`` is false.
+        measured: the measured values; NaN where ``valid`` is false.
         noise_chol: Cholesky factor of the noise ``(*batch, blocks, size, size)`` as a function of the mean.
     """
     blocks, size = measured.shape[-2:]
 
     def linearise(mean: Tensor, factor: Tensor) -> Rows:
         """Rows of all blocks, by statistical linear regression."""
-        A, b, error = slr(lambda x: h(x).flatten(-2), mean, lower_factor(factor))
-        residual = measured - (apply(A, mean) + b).unflatten(-1, (blocks, size))
+        model = slr(lambda x: h(x).flatten(-2), mean, lower_factor(factor))
+        residual = measured - model.at(mean).unflatten(-1, (blocks, size))
         residual = torch.where(valid[..., None], residual, 0.0)
-        A, error = (matrix.unflatten(-2, (blocks, size)) for matrix in (A, error))
+        A, error = (matrix.unflatten(-2, (blocks, size)) for matrix in (model.A, model.error))
         return whitened_rows(A, residual, error, noise_chol(mean), valid)
 
     return linearise
 
 
 def iterated_update(
-    linearise: Linearise,
-    prior_mean: Float[Tensor, "*batch state"],
-    prior_root: Float[Tensor, "*batch rows state"],
-    start_mean: Float[Tensor, "*batch state"],
-    start_factor: Float[Tensor, "*batch state state"],
-    *,
-    max_iterations: int = 20,
-    tolerance: float = 1e-9,
+    linearise: Linearise, prior: Prior, start: Gaussian, *, max_iterations: int = 20, tolerance: float = 1e-9
 ) -> Posterior:
     """Posterior given the prior and all measurements, relinearised about itself until it stands still.
 
     Args:
         linearise: see ``measurement``.
-        prior_mean, prior_root: prior as ‖prior_root (x - prior_mean)‖²; zero rows are a flat prior.
-        start_mean, start_factor: Gaussian about which the first pass linearises; no information of its own. The
-            factor is triangular.
+        start: Gaussian about which the first pass linearises; it carries no information. Its factor is triangular.
         tolerance: Kullback-Leibler divergence, nats, between two iterates below which a problem has converged.
     """
-    mean, factor = start_mean, start_factor
-    rows = linearise(mean, factor)
-    running = torch.isfinite(_cost(rows, mean, prior_mean, prior_root))
-    failed, path, iterations = ~running, [mean], torch.zeros_like(running, dtype=torch.long)
+    objective = _Objective(linearise, prior)
+    here, factor = objective.at(start.mean, start.factor), start.factor
+    running = torch.isfinite(here.cost)
+    failed, path, iterations = ~running, [here.mean], torch.zeros_like(running, dtype=torch.long)
     for _ in range(max_iterations):
-        target, new_factor, root = _solve(rows, mean, prior_mean, prior_root)
-        divergence = _divergence(target - mean, root, factor)
-        ok = torch.isfinite(divergence) & torch.isfinite(target).all(-1)
+        target = objective.minimum(here)
+        divergence = _divergence(target, here.mean, factor)
+        ok = torch.isfinite(divergence) & torch.isfinite(target.mean).all(-1)
         failed = failed | (running & ~ok)
         moved, running = running & ok, running & ok & (divergence > tolerance)
-        factor = torch.where(moved[..., None, None], new_factor, factor)
+        factor = torch.where(moved[..., None, None], target.factor, factor)
         iterations = iterations + moved
         if not bool(running.any()):  # nothing is linearised about a last step
-            mean = torch.where(moved[..., None], target, mean)
-            path.append(mean)
+            path.append(torch.where(moved[..., None], target.mean, here.mean))
             break
-        new_mean, rows = _damped(linearise, rows, mean, target, new_factor, running, prior_mean, prior_root)
-        mean = torch.where(moved[..., None], new_mean, mean)
-        path.append(mean)
+        ahead = objective.damped(here, target, running)
+        here = replace(ahead, mean=torch.where(moved[..., None], ahead.mean, here.mean))
+        path.append(here.mean)
     info = torch.where(failed, int(Info.SINGULAR), torch.where(running, int(Info.NOT_CONVERGED), int(Info.OK)))
-    return Posterior(mean, factor, torch.stack(path), iterations, ~failed & ~running, info)
+    return Posterior(path[-1], factor, torch.stack(path), iterations, ~failed & ~running, info)
 
 
-def _cost(rows: Rows, mean: Tensor, prior_mean: Tensor, prior_root: Tensor) -> Tensor:
-    """Twice the negative log density of the measurements and the prior at ``mean``, but for a constant."""
-    from_prior = apply(prior_root, mean - prior_mean)
-    return rows.matrix[..., -1].square().sum(-1) + from_prior.square().sum(-1) + rows.log_det
+@dataclass(frozen=True)
+class _Point:
+    """A mean, the rows about it, and the cost at it."""
+
+    mean: Tensor
+    rows: Rows
+    cost: Tensor
 
 
-def _solve(rows: Rows, mean: Tensor, prior_mean: Tensor, prior_root: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Mean, covariance factor and information root of the posterior under the linearised measurements."""
-    to_prior = apply(prior_root, prior_mean - mean)[..., None]
-    stacked = torch.cat([torch.cat([prior_root, to_prior], -1).expand(*mean.shape[:-1], -1, -1), rows.matrix], -2)
-    triangle = upper_root(stacked)
-    state = mean.shape[-1]
-    root, right = triangle[..., :state, :state], triangle[..., :state, state:]
-    eye = torch.eye(state, dtype=mean.dtype, device=mean.device).expand_as(root)
-    solution = solve_upper(root, torch.cat([eye, right], -1))
-    return mean + solution[..., state], solution[..., :state], root
+@dataclass(frozen=True)
+class _Target:
+    """Posterior under linearised measurements: mean, covariance factor and information root, its inverse."""
+
+    mean: Tensor
+    factor: Tensor
+    root: Tensor
 
 
-def _damped(
-    linearise: Linearise,
-    rows: Rows,
-    mean: Tensor,
-    target: Tensor,
-    factor: Tensor,
-    running: Tensor,
-    prior_mean: Tensor,
-    prior_root: Tensor,
-) -> tuple[Tensor, Rows]:
-    """As far towards ``target`` as the cost does not rise, and the rows there; mostly the full step.
+@dataclass(frozen=True)
+class _Objective:
+    """The cost that the iteration lowers: twice the negative log density of measurements and prior, less a constant."""
 
-    Problems that are not running any more take the full step: it is too short to overshoot.
-    """
-    ceiling = _cost(rows, mean, prior_mean, prior_root) + _COST_SLACK
-    step = torch.ones_like(ceiling)
-    for _ in range(_HALVINGS):
-        candidate = mean + step[..., None] * (target - mean)
-        new_rows = linearise(candidate, factor)
-        high = running & (_cost(new_rows, candidate, prior_mean, prior_root) > ceiling)
-        if not bool(high.any()):
-            break
-        step = torch.where(high, step / 2, step)
-    return candidate, new_rows
+    linearise: Linearise
+    prior: Prior
+
+    def at(self, mean: Tensor, factor: Tensor) -> _Point:
+        """The measurements linearised about a Gaussian."""
+        rows = self.linearise(mean, factor)
+        from_prior = self.prior.residual(mean)
+        cost = rows.matrix[..., -1].square().sum(-1) + from_prior.square().sum(-1) + rows.log_det
+        return _Point(mean, rows, cost)
+
+    def minimum(self, here: _Point) -> _Target:
+        """The full step: the minimum of the objective with the measurements as they are linearised."""
+        mean, prior_root = here.mean, self.prior.root
+        to_prior = -self.prior.residual(mean)[..., None]
+        prior_rows = torch.cat([prior_root, to_prior], -1).expand(*mean.shape[:-1], -1, -1)
+        triangle = upper_root(torch.cat([prior_rows, here.rows.matrix], -2))
+        state = mean.shape[-1]
+        root, right = triangle[..., :state, :state], triangle[..., :state, state:]
+        eye = torch.eye(state, dtype=mean.dtype, device=mean.device).expand_as(root)
+        solution = solve_upper(root, torch.cat([eye, right], -1))
+        return _Target(mean + solution[..., state], solution[..., :state], root)
+
+    def damped(self, here: _Point, target: _Target, running: Tensor) -> _Point:
+        """As far towards the target as the cost does not rise; mostly the full step.
+
+        Problems that are not running any more take the full step: it is too short to overshoot.
+        """
+        step = torch.ones_like(here.cost)
+        for _ in range(_HALVINGS):
+            ahead = self.at(here.mean + step[..., None] * (target.mean - here.mean), target.factor)
+            high = running & (ahead.cost > here.cost + _COST_SLACK)
+            if not bool(high.any()):
+                break
+            step = torch.where(high, step / 2, step)
+        return ahead
 
 
-def _divergence(move: Tensor, root: Tensor, old_factor: Tensor) -> Tensor:
-    """Kullback-Leibler divergence, nats, of the old Gaussian from the new one (information root, upper triangular)."""
-    ratio = root @ old_factor
-    log_det = _log_diagonal(root) + _log_diagonal(old_factor)
-    distance = apply(root, move).square().sum(-1)
-    return (ratio.square().sum((-2, -1)) - move.shape[-1] + distance) / 2 - log_det
+def _divergence(new: _Target, old_mean: Tensor, old_factor: Tensor) -> Tensor:
+    """Kullback-Leibler divergence, nats, of the old Gaussian from the new one."""
+    ratio = new.root @ old_factor
+    log_det = _log_diagonal(new.root) + _log_diagonal(old_factor)
+    distance = apply(new.root, new.mean - old_mean).square().sum(-1)
+    return (ratio.square().sum((-2, -1)) - old_mean.shape[-1] + distance) / 2 - log_det
 
 
 def _log_diagonal(triangle: Tensor) -> Tensor:
+    """Log-determinant of triangular matrices, but for the sign."""
     return triangle.diagonal(dim1=-2, dim2=-1).abs().log().sum(-1)

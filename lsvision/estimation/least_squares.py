@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from lsvision.estimation.derivative import jacobian as jacobian_of
-from lsvision.estimation.triangular import apply, solve_upper, upper_root
+from lsvision.estimation.linalg import apply, solve_upper, upper_root
 
 _FIRST_DAMPING = 1e-6  # of the Jacobian's columns, scaled to unit length
 _LARGEST_DAMPING = 1e8
@@ -19,7 +19,7 @@ _LARGEST_DAMPING = 1e8
 
 @dataclass(frozen=True)
 class LeastSquares:
-    """Minimum of ‖residual‖²; ``factor @ factor.mT`` is (Jᵀ J)⁻¹ there, ``path`` the state by iteration."""
+    """Minimum of ‖residual‖²; ``factor @ factor.mT`` is (Jᵀ J)⁻¹ at it, ``path`` the state by iteration."""
 
     state: Float[Tensor, "*batch state"]
     factor: Float[Tensor, "*batch state state"]
@@ -39,7 +39,7 @@ def levenberg_marquardt(
 
     Args:
         residual: takes ``(*batch, state)`` to whitened residuals ``(*batch, rows)``; at least as many rows as states.
-        tolerance: length of a step, in standard deviations of the state, at which a problem has converged.
+        tolerance: length of a step, in sigmas of the state, at which a problem has converged.
     """
     state, values, path = start, residual(start), [start]
     damping = torch.full_like(start[..., 0], _FIRST_DAMPING)
@@ -57,7 +57,7 @@ def levenberg_marquardt(
         path.append(state)
         damping = torch.where(better, damping / 10, damping * 10)
         length = apply(jacobian, step).square().sum(-1).sqrt()
-        settled = (length <= tolerance) & (damping <= 1)  # a step that damping made short says nothing
+        settled = (length <= tolerance) & (damping <= 1)  # damping made the other steps short
         converged = converged | (running & settled)
         running = running & ~settled & (damping < _LARGEST_DAMPING)
         if not bool(running.any()):
@@ -69,7 +69,7 @@ def levenberg_marquardt(
 
 
 def _damped_step(jacobian: Tensor, values: Tensor, damping: Tensor) -> Tensor:
-    """Solution of min ‖J dx + r‖² + damping ‖D dx‖², D the lengths of J's columns."""
+    """Solution dx of min ‖J dx + r‖² + damping ‖D dx‖², D the lengths of J's columns."""
     lengths = torch.linalg.vector_norm(jacobian, dim=-2)
     weight = torch.diag_embed(lengths * damping.sqrt()[..., None])
     right = torch.cat([-values, torch.zeros_like(lengths)], dim=-1)
@@ -81,7 +81,7 @@ def _damped_step(jacobian: Tensor, values: Tensor, damping: Tensor) -> Tensor:
 def _batch_jacobian(residual: Callable[[Tensor], Tensor], state: Tensor) -> Tensor:
     """Derivative ``(*batch, rows, state)`` of a function that works problem by problem.
 
-    One column a direction, the same for all problems: J e_i is the derivative along e_i.
+    All problems are moved along one direction e_i at a time, which gives column i of every J.
     """
     offset = torch.zeros_like(state[(0,) * (state.ndim - 1)])
     return jacobian_of(lambda move: residual(state + move), offset)

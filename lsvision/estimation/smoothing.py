@@ -1,4 +1,4 @@
-"""Rauch-Tung-Striebel cubature smoother in square-root form.
+"""Library API: Rauch-Tung-Striebel cubature smoother in square-root form.
 
 Backwards from the last filtered state, with the moments of the transition f over the filtered Gaussian N(m, L Lᵀ):
 
@@ -9,48 +9,50 @@ Source: Särkkä & Svensson 2023, Bayesian Filtering and Smoothing, ch. 14; Aras
 """
 
 import torch
-from jaxtyping import Float
 from torch import Tensor
 
 from lsvision.estimation.cubature import Function, sigma_moments
-from lsvision.estimation.filtering import Track
-from lsvision.estimation.square_root import absorb, forward_substitute, ordered_sum
+from lsvision.estimation.filtering import StateSpace, Track
+from lsvision.estimation.gaussian import BatchLast, Gaussian
+from lsvision.estimation.linalg import absorb, forward_substitute, ordered_sum
 
 
-def smooth(
-    track: Track, process_chol: Float[Tensor, "*#batch state state"], f: Function | None = None
-) -> tuple[Float[Tensor, "steps *batch state"], Float[Tensor, "steps *batch state state"]]:
-    """Means and covariance factors of all states given all measurements.
+def smooth(track: Track, model: StateSpace) -> Gaussian:
+    """All states given all measurements, ``(steps, *batch)``.
 
     Args:
-        track: of ``filter_sequence`` with its history, and the same ``process_chol`` and ``f``.
+        track: of ``filter_sequence`` with its history, and the model it was filtered with.
 
     Raises:
         ValueError: the track was made without its history.
     """
     if len(track.factors) != len(track.means):
         raise ValueError(f"track must hold a factor for each of {len(track.means)} steps, has {len(track.factors)}")
-    process = process_chol.expand_as(track.factors[0]).movedim((-2, -1), (0, 1))
+    process = model.process_chol.expand_as(track.factors).movedim((-2, -1), (1, 2))
     means, factors = track.means.movedim(-1, 1), track.factors.movedim((-2, -1), (1, 2))
-    smoothed = [(means[-1], factors[-1])]
-    for mean, factor in zip(means[:-1].flip(0), factors[:-1].flip(0), strict=True):
-        smoothed.append(_step_back(f, mean, factor, process, *smoothed[-1]))
-    smoothed_means, smoothed_factors = (torch.stack(part[::-1]) for part in zip(*smoothed, strict=True))
-    return smoothed_means.movedim(1, -1), smoothed_factors.movedim((1, 2), (-2, -1))
+    filtered = [BatchLast(*moments) for moments in zip(means, factors, strict=True)]
+    smoothed = [filtered[-1]]
+    for k in reversed(range(len(filtered) - 1)):
+        smoothed.append(_step_back(model.f, filtered[k], smoothed[-1], process[k + 1]))
+    return Gaussian(
+        torch.stack([state.mean for state in reversed(smoothed)]).movedim(1, -1),
+        torch.stack([state.factor for state in reversed(smoothed)]).movedim((1, 2), (-2, -1)),
+    )
 
 
-def _step_back(
-    f: Function | None, mean: Tensor, factor: Tensor, process: Tensor, next_mean: Tensor, next_factor: Tensor
-) -> tuple[Tensor, Tensor]:
-    """Smoothed mean and factor of one state from those of the next; batch last."""
+def _step_back(f: Function | None, filtered: BatchLast, following: BatchLast, process: Tensor) -> BatchLast:
+    """Smoothed state from the filtered one and the smoothed one that follows it; ``process`` is √Q between them."""
+    mean, factor = filtered.mean, filtered.factor
     if f is None:
-        predicted, deviations, own = mean, factor, factor
+        predicted, moved, still = mean, factor, factor
     else:
-        predicted, odd, even = sigma_moments(f, mean, factor)
-        deviations, own = torch.cat([odd, even], dim=1), torch.cat([factor, torch.zeros_like(even)], dim=1)
-    root, remainder = absorb(process, deviations, own)
+        moments = sigma_moments(f, mean, factor)
+        predicted, moved = moments.center, moments.factor
+        still = torch.cat([factor, torch.zeros_like(moments.even)], dim=1)
+    root, remainder = absorb(process, moved, still)
     size = len(mean)
-    whitened = forward_substitute(root[:size], torch.cat([(next_mean - predicted)[:, None], next_factor], dim=1))
+    correction = torch.cat([(following.mean - predicted)[:, None], following.factor], dim=1)
+    whitened = forward_substitute(root[:size], correction)
     gained = ordered_sum(root[size:, :, None] * whitened)[:, 0]
     smoothed_factor, _ = absorb(torch.zeros_like(process), torch.cat([gained[:, 1:], remainder], dim=1))
-    return mean + gained[:, 0], smoothed_factor
+    return BatchLast(mean + gained[:, 0], smoothed_factor)

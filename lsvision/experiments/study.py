@@ -16,7 +16,7 @@ from lsvision.simulation import BoardPose
 from lsvision.stages.calibration.config import CalibrationConfig
 from lsvision.study.map import tilt_map
 from lsvision.study.points import Conditions, exact_corners, study_points
-from lsvision.study.runs import run_points
+from lsvision.study.runs import Sampling, run_points
 from lsvision.study.tables import iterations_table, points_table, runs_table
 from lsvision.types import Board, Rig
 
@@ -53,15 +53,8 @@ def run_study(settings: StudySettings, folder: Path) -> None:
     points = study_points(settings.conditions, settings.axes)
     corners = [exact_corners(settings.rig, settings.board, settings.placings, point) for point in points]
     log.info("%d points of %d calibrations each", len(points), settings.runs)
-    results = run_points(
-        points,
-        corners,
-        settings.calibration,
-        runs=settings.runs,
-        batch=settings.batch,
-        seed=settings.seed,
-        threads=settings.threads,
-    )
+    sampling = Sampling(settings.runs, settings.batch, settings.seed, settings.threads)
+    results = run_points(points, corners, settings.calibration, sampling)
     runs = runs_table(points, corners, results)
     study = Study(
         title=settings.title,

@@ -1,8 +1,12 @@
 """Rigid transforms: rotation vectors and the best fit between two point sets."""
 
+from dataclasses import dataclass
+
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
+
+# Ours, not kornia's: as exact (9e-16) and fast (0.37, 0.36 ms), but its other last bits move ill-posed n by up to 1e-9.
 
 # Below this angle the closed forms of sin(a)/a and (1 - cos a)/a² lose digits; their series do not.
 _SMALL_ANGLE = 1e-3
@@ -19,10 +23,9 @@ def transform(
 
 def rotation_from_vector(vector: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
     """Rotation matrix of a rotation vector, rad: Rodrigues' formula, smooth and differentiable at zero."""
-    first, second, _ = _rodrigues_factors(vector)
-    cross = _cross_matrix(vector)
+    factors, cross = _rodrigues_factors(vector), _cross_matrix(vector)
     eye = torch.eye(3, dtype=vector.dtype, device=vector.device)
-    return eye + first * cross + second * (cross @ cross)
+    return eye + factors.sine * cross + factors.versine * (cross @ cross)
 
 
 def left_jacobian(vector: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
@@ -30,10 +33,9 @@ def left_jacobian(vector: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 
 
     Source: Chirikjian 2011, Stochastic Models, Information Theory, and Lie Groups, vol. 2, Eq. 10.86.
     """
-    _, second, third = _rodrigues_factors(vector)
-    cross = _cross_matrix(vector)
+    factors, cross = _rodrigues_factors(vector), _cross_matrix(vector)
     eye = torch.eye(3, dtype=vector.dtype, device=vector.device)
-    return eye + second * cross + third * (cross @ cross)
+    return eye + factors.versine * cross + factors.remainder * (cross @ cross)
 
 
 def vector_from_rotation(rotation: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3"]:
@@ -47,7 +49,7 @@ def vector_from_rotation(rotation: Float[Tensor, "*batch 3 3"]) -> Float[Tensor,
 
 
 def euler_angles(rotation: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3"]:
-    """Angles (about X, Y, Z), rad, with R = Rz Ry Rx. For reports only: they fold at Y = ±pi/2."""
+    """Angles (about X, Y, Z), rad, with R = Rz Ry Rx. For reports and headings: they fold at Y = ±pi/2."""
     about_x = torch.atan2(rotation[..., 2, 1], rotation[..., 2, 2])
     about_y = torch.asin((-rotation[..., 2, 0]).clamp(-1.0, 1.0))
     about_z = torch.atan2(rotation[..., 1, 0], rotation[..., 0, 0])
@@ -76,7 +78,7 @@ def fit_rigid(
     source, target = (torch.where(weight > 0, points, 0.0) for points in (source, target))
     source_mean, target_mean = (weight * source).sum(-2), (weight * target).sum(-2)
     from_target, from_source = weight * (target - target_mean[..., None, :]), source - source_mean[..., None, :]
-    # A sum, not a matrix product: the last bits of that depend on where in a batch the points lie.
+    # A sum, not a matrix product: see estimation.linalg.
     covariance = (from_target[..., :, None] * from_source[..., None, :]).sum(-3)
     u, _, vh = torch.linalg.svd(covariance)
     sign = torch.ones_like(u[..., 0])
@@ -92,16 +94,26 @@ def _cross_matrix(vector: Tensor) -> Tensor:
     return torch.stack(rows, dim=-2)
 
 
-def _rodrigues_factors(vector: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """sin(a)/a, (1 - cos a)/a² and (a - sin a)/a³ of the angle a, each (*batch, 1, 1)."""
+@dataclass(frozen=True)
+class _RodriguesFactors:
+    """sin(a)/a, (1 - cos a)/a² and (a - sin a)/a³ of an angle a, the factors of the cross matrix and of its square."""
+
+    sine: Float[Tensor, "*batch 1 1"]
+    versine: Float[Tensor, "*batch 1 1"]
+    remainder: Float[Tensor, "*batch 1 1"]
+
+
+def _rodrigues_factors(vector: Tensor) -> _RodriguesFactors:
     squared = (vector * vector).sum(-1)[..., None, None]
     small = squared < _SMALL_ANGLE**2
     safe = torch.where(small, 1.0, squared)  # keeps NaN out of the gradient of the branch not taken
     angle = safe.sqrt()
-    first = torch.where(small, 1 - squared / 6 + squared**2 / 120, torch.sin(angle) / angle)
-    second = torch.where(small, 0.5 - squared / 24 + squared**2 / 720, 2 * torch.sin(angle / 2) ** 2 / safe)
-    third = torch.where(small, 1 / 6 - squared / 120 + squared**2 / 5040, (angle - torch.sin(angle)) / (safe * angle))
-    return first, second, third
+    sine = torch.where(small, 1 - squared / 6 + squared**2 / 120, torch.sin(angle) / angle)
+    versine = torch.where(small, 0.5 - squared / 24 + squared**2 / 720, 2 * torch.sin(angle / 2) ** 2 / safe)
+    remainder = torch.where(
+        small, 1 / 6 - squared / 120 + squared**2 / 5040, (angle - torch.sin(angle)) / (safe * angle)
+    )
+    return _RodriguesFactors(sine, versine, remainder)
 
 
 def _quaternion(rotation: Tensor) -> Tensor:

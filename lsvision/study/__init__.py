@@ -1,1 +1,1 @@
-"""The Monte Carlo behind the studies: points, runs, tables, map."""
+"""The Monte Carlo behind the studies: points, runs, tables, and the map of tilts."""

@@ -1,4 +1,4 @@
-"""What a second board would tell, by its tilt: the map that says which boards to scan."""
+"""How well a flat board and a second one would determine n, by the tilt of the second: which boards to scan."""
 
 from dataclasses import replace
 
@@ -7,16 +7,21 @@ import torch
 from lsvision.estimation import cramer_rao_bound
 from lsvision.report import TiltMap
 from lsvision.simulation import BoardPose
-from lsvision.stages.calibration.model import motion_information
+from lsvision.stages.calibration.linearise import motion_information
 from lsvision.stages.calibration.observability import simulated_information
 from lsvision.study.points import Conditions, exact_corners, noise_chol, true_problem
 from lsvision.types import Board, Rig
 
 
 def tilt_map(rig: Rig, board: Board, conditions: Conditions, range_deg: float, steps: int) -> TiltMap:
-    """Bound on sigma of n's least known direction from a flat board and one tilted by every pitch and roll of a grid.
+    """Bound on the sigma of n along its weakest direction, from a flat board and a second one, over a grid of tilts.
 
     No calibrations are run: it is the Cramér-Rao bound, the prior included.
+
+    Args:
+        conditions: noise, motion and prior; their boards are not used.
+        range_deg: largest tilt of the second board about X and about Y, deg, to either side.
+        steps: tilts about each axis.
     """
     placed = replace(conditions, boards="flat")
     corners = exact_corners(rig, board, {"flat": [BoardPose(0.0, 0.0, 0.0)]}, placed)

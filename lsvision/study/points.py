@@ -1,4 +1,4 @@
-"""The points of a study: what is simulated and estimated at each, and the corners that a board shows there exactly."""
+"""The points of a study: their conditions, and the exact corners of the boards under them."""
 
 import itertools
 import math
@@ -7,12 +7,14 @@ from dataclasses import asdict, dataclass, fields, replace
 
 import dacite
 import torch
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from lsvision.errors import ConfigError
 from lsvision.simulation import Acquisition, BoardPose, MotionConfig, SceneConfig, SensorConfig, Simulation, simulate
 from lsvision.stages.calibration.config import CalibrationConfig
-from lsvision.stages.calibration.model import BoardProblem, join_state, motion_information, nominal_problem
+from lsvision.stages.calibration.linearise import motion_information
+from lsvision.stages.calibration.problem import BoardProblem, BoardState, nominal_problem
 from lsvision.types import Board, CalibrationMethod, Rig
 
 # Of the simulated scan; corners are taken between its lines, so that it rounds nothing.
@@ -21,11 +23,11 @@ _LINE_PITCH_MM = 0.07
 
 @dataclass(frozen=True)
 class Conditions:
-    """One point of a study: the boards' placing, the installation, what disturbs the corners, and how n is estimated.
+    """One point of a study: the boards' placing, the installation, disturbances of the corners, and the method for n.
 
     ``corner_sigma_mm`` is the white noise of x and of the travel, ``depth_sigma_mm`` that of z; the calibration knows
-    both. It does not know of the vibration of x and z and of the encoder's error, sine waves with phases of their own
-    in every scan, given as rms values.
+    both. It does not know the vibration of x and z and the encoder's error: sine waves of a given rms, with other
+    phases in every scan.
     """
 
     boards: str
@@ -57,20 +59,20 @@ class Conditions:
 class ExactCorners:
     """The corners of a point's boards without noise, and the truth: ``points`` (x, travel, z) mm, poses and n."""
 
-    points: Tensor
-    board_points: Tensor
-    rotation: Tensor
-    translation: Tensor
-    n: Tensor
+    points: Float[Tensor, "boards corners 3"]
+    board_points: Float[Tensor, "boards corners 3"]
+    rotation: Float[Tensor, "boards 3 3"]
+    translation: Float[Tensor, "boards 3"]
+    n: Float[Tensor, "3"]
 
     @property
-    def valid(self) -> Tensor:
-        """All corners are seen, ``(boards, corners)``."""
+    def valid(self) -> Bool[Tensor, "boards corners"]:
+        """All corners are seen."""
         return torch.ones(self.points.shape[:-1], dtype=torch.bool)
 
     @property
     def depth_span_mm(self) -> float:
-        """Nearest to farthest corner of any board: what the cameras' range of depth has to hold."""
+        """Depth from the nearest to the farthest corner of a board, the largest of all boards."""
         z = self.points[..., 2]
         return float((z.amax(-1) - z.amin(-1)).max())
 
@@ -81,11 +83,11 @@ class ExactCorners:
         return math.degrees(math.acos(min(1.0, float((normals @ normals.mT).min()))))
 
 
-def study_points(base: Conditions, axes: Mapping[str, Sequence[float | str] | None]) -> list[Conditions]:
+def study_points(base: Conditions, axes: Mapping[str, Sequence[float | int | str] | None]) -> list[Conditions]:
     """The grid of all axes, the last one fastest, over the base's conditions; an axis of None stays at its value.
 
     Raises:
-        ConfigError: an axis that is no condition, is empty, or a value of the wrong type.
+        ConfigError: an axis that is no condition or is empty, or a value of the wrong type.
     """
     known = [item.name for item in fields(Conditions)]
     varied = {name: values for name, values in axes.items() if values is not None}
@@ -128,8 +130,8 @@ def exact_corners(
     )
 
 
-def noise_chol(conditions: Conditions) -> Tensor:
-    """Cholesky factor of the covariance that the calibration is told, ``(3, 3)`` mm."""
+def noise_chol(conditions: Conditions) -> Float[Tensor, "3 3"]:
+    """Cholesky factor of the covariance of a corner that the calibration assumes, mm."""
     corner, depth = conditions.corner_sigma_mm, conditions.depth_sigma_mm
     for name, value in (("corner_sigma_mm", corner), ("depth_sigma_mm", depth)):
         if not value > 0:
@@ -137,20 +139,20 @@ def noise_chol(conditions: Conditions) -> Tensor:
     return torch.diag(torch.tensor([corner, corner, depth], dtype=torch.float64))
 
 
-def true_information(corners: ExactCorners, conditions: Conditions) -> Tensor:
-    """Fisher information of a point's corners on n at the truth, the poses unknown, without the prior; ``(3, 3)``."""
+def true_information(corners: ExactCorners, conditions: Conditions) -> Float[Tensor, "3 3"]:
+    """Fisher information of a point's corners on n at the truth, the poses unknown, without the prior."""
     problem, state = true_problem(corners, noise_chol(conditions))
     return motion_information(problem, state)
 
 
-def true_problem(corners: ExactCorners, chol: Tensor) -> tuple[BoardProblem, Tensor]:
-    """The calibration's problem with exact corners, written about the true poses, and the true state."""
+def true_problem(corners: ExactCorners, chol: Float[Tensor, "3 3"]) -> tuple[BoardProblem, Float[Tensor, " state"]]:
+    """The calibration's problem with exact corners and the true poses as the nominal ones, and the true state."""
     problem, _ = nominal_problem(
         corners.points, chol.expand(*corners.points.shape, 3), corners.board_points, corners.valid
     )
     problem = replace(problem, rotation=corners.rotation)
     position = corners.translation + (corners.rotation @ problem.centroid[..., None])[..., 0]
-    return problem, join_state(torch.zeros_like(position), position, corners.n)
+    return problem, BoardState(torch.zeros_like(position), position, corners.n).join()
 
 
 def _simulation(rig: Rig, board: Board, pose: BoardPose, conditions: Conditions) -> Simulation:

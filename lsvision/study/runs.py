@@ -1,13 +1,13 @@
-"""Many noisy calibrations of a study's points: drawn, calibrated in batches, gathered."""
+"""Many noisy calibrations of a study's points: drawn, calibrated in batches, joined."""
 
 import math
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import partial
 
 import torch
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from lsvision.report.progress import progress_bars
@@ -15,67 +15,103 @@ from lsvision.stages.calibration.calibrate import BatchCalibration, calibrate_ba
 from lsvision.stages.calibration.config import CalibrationConfig
 from lsvision.study.points import Conditions, ExactCorners, noise_chol
 
-# Runs whose noise comes from one seed. Fixed, so that a run's noise does not depend on the batch it is calibrated in.
+# Runs whose noise comes from one generator. Fixed, so that a run's noise does not depend on its batch.
 _BLOCK = 64
-# Blocks of one study's seed; those of the next seed follow.
+# Block b of a study with seed s draws from a generator seeded s * _BLOCKS_PER_SEED + b.
 _BLOCKS_PER_SEED = 1_000_003
 
 
 @dataclass(frozen=True)
 class PointRuns:
-    """All runs of one point: what each calibration found, and how its RMSE fell; ``(runs, ..)``, mm.
+    """All runs of one point, the fields as in ``BatchCalibration``.
 
-    ``rmse_path_mm`` is ``(iterations, runs)`` from the state before, and repeats the result past a run's last.
+    ``rmse_path_mm`` starts with the state before, and repeats the result past a run's last iteration.
     """
 
-    n: Tensor
-    covariance: Tensor
-    rmse_path_mm: Tensor
-    iterations: Tensor
-    converged: Tensor
-    noise_scale: Tensor
-    info: Tensor
+    n: Float[Tensor, "runs 3"]
+    covariance: Float[Tensor, "runs 3 3"]
+    rmse_path_mm: Float[Tensor, "iterations runs"]
+    iterations: Int[Tensor, " runs"]
+    converged: Bool[Tensor, " runs"]
+    noise_scale: Float[Tensor, " runs"]
+    info: Int[Tensor, " runs"]
+
+    @classmethod
+    def join(cls, batches: Sequence[BatchCalibration]) -> "PointRuns":
+        """The runs of all batches of one point."""
+        longest = max(len(batch.rmse_path_mm) for batch in batches)
+        paths = [
+            torch.cat([path, path[-1:].expand(longest - len(path), -1)])
+            for path in (batch.rmse_path_mm for batch in batches)
+        ]
+        fields = ("n", "covariance", "iterations", "converged", "noise_scale", "info")
+        return cls(
+            rmse_path_mm=torch.cat(paths, dim=1),
+            **{name: torch.cat([getattr(batch, name) for batch in batches]) for name in fields},
+        )
 
 
 @dataclass(frozen=True)
-class Task:
-    """Some runs of one point, calibrated as one batch."""
+class Sampling:
+    """How many calibrations are made of every point, from which seed, and how they are run.
+
+    ``batch`` runs are calibrated at once, each batch on one of ``threads`` threads; neither changes a bit.
+    """
+
+    runs: int
+    batch: int = 256
+    seed: int = 0
+    threads: int = 1
+
+
+@dataclass(frozen=True)
+class _Batch:
+    """Runs ``first..last-1`` of one point, calibrated at once."""
 
     point: int
+    conditions: Conditions
+    corners: ExactCorners
     first: int
     last: int
 
+    def calibrate(self, config: CalibrationConfig, seed: int) -> BatchCalibration:
+        """The calibrations of the runs."""
+        measured = noisy_points(self.corners, self.conditions, seed, self.first, self.last)
+        chol = noise_chol(self.conditions)
+        covariance = (chol @ chol.mT).expand(*self.corners.points.shape, 3)
+        options = self.conditions.calibration(config)
+        with torch.inference_mode():
+            return calibrate_batch(measured, covariance, self.corners.board_points, self.corners.valid, options)
+
 
 def run_points(
-    points: Sequence[Conditions],
-    corners: Sequence[ExactCorners],
-    config: CalibrationConfig,
-    *,
-    runs: int,
-    batch: int,
-    seed: int,
-    threads: int,
+    points: Sequence[Conditions], corners: Sequence[ExactCorners], config: CalibrationConfig, sampling: Sampling
 ) -> list[PointRuns]:
-    """Calibrate ``runs`` noisy copies of every point's corners, ``batch`` at a time, on several threads.
+    """Calibrate noisy copies of every point's corners, in batches on several threads.
 
-    A run's noise follows from the seed and the run's number alone: every point sees the same draws, so that what
-    differs between points is due to them, and neither the batch size nor the threads change a bit.
+    A run's noise follows from the seed and the run's number alone: every point gets the same draws, so that
+    differences between points are due to their conditions.
     """
-    tasks = [
-        Task(point, first, min(first + batch, runs)) for point in range(len(points)) for first in range(0, runs, batch)
+    runs, size = sampling.runs, sampling.batch
+    batches = [
+        _Batch(index, conditions, exact, first, min(first + size, runs))
+        for index, (conditions, exact) in enumerate(zip(points, corners, strict=True))
+        for first in range(0, runs, size)
     ]
-    work = partial(_calibrate, points, corners, config, seed)
     found: list[list[BatchCalibration]] = [[] for _ in points]
-    with progress_bars() as bars, _one_torch_thread(), ThreadPoolExecutor(threads) as pool:
+    with progress_bars() as bars, _one_torch_thread(), ThreadPoolExecutor(sampling.threads) as pool:
         bar = bars.start("calibrate", total=len(points) * runs)
-        for task, result in zip(tasks, pool.map(work, tasks), strict=True):
-            found[task.point].append(result)
-            bars.advance(bar, task.last - task.first)
-    return [_joined(batches) for batches in found]
+        results = pool.map(lambda batch: batch.calibrate(config, sampling.seed), batches)
+        for batch, result in zip(batches, results, strict=True):
+            found[batch.point].append(result)
+            bars.advance(bar, batch.last - batch.first)
+    return [PointRuns.join(of_point) for of_point in found]
 
 
-def noisy_points(corners: ExactCorners, conditions: Conditions, seed: int, first: int, last: int) -> Tensor:
-    """Measured corners of runs ``first..last-1``: ``(runs, boards, corners, 3)``, mm."""
+def noisy_points(
+    corners: ExactCorners, conditions: Conditions, seed: int, first: int, last: int
+) -> Float[Tensor, "runs boards corners 3"]:
+    """Measured corners (x, travel, z), mm, of runs ``first..last-1``."""
     blocks = range(first // _BLOCK, -(-last // _BLOCK))
     drawn = [_draws(corners, (seed * _BLOCKS_PER_SEED + block) % 2**32) for block in blocks]
     skip = first - blocks.start * _BLOCK
@@ -90,9 +126,9 @@ def noisy_points(corners: ExactCorners, conditions: Conditions, seed: int, first
 
 
 def _draws(corners: ExactCorners, seed: int) -> tuple[Tensor, Tensor]:
-    """One block's white noise ``(runs, boards, corners, 3)`` and phases ``(runs, boards, 3)``.
+    """White noise ``(runs, boards, corners, 3)`` and phases ``(runs, boards, 3)`` of one block.
 
-    Board by board, so that the first boards of every placing see the same.
+    Drawn board by board, so that the first boards of every placing get the same.
     """
     generator = torch.Generator().manual_seed(seed)
     boards, count = corners.points.shape[:2]
@@ -104,38 +140,14 @@ def _draws(corners: ExactCorners, seed: int) -> tuple[Tensor, Tensor]:
 
 
 def _wave(travel: Tensor, wavelength_mm: float, phase: Tensor) -> Tensor:
-    """Sine waves of rms one along the travel, ``(runs, boards, corners, waves)``."""
+    """Sine waves along the travel whose rms is one, ``(runs, boards, corners, waves)``."""
     angle = (2 * math.pi / wavelength_mm) * travel
     return math.sqrt(2.0) * torch.sin(angle[..., None] + phase[..., None, :])
 
 
-def _calibrate(
-    points: Sequence[Conditions], corners: Sequence[ExactCorners], config: CalibrationConfig, seed: int, task: Task
-) -> BatchCalibration:
-    conditions, exact = points[task.point], corners[task.point]
-    measured = noisy_points(exact, conditions, seed, task.first, task.last)
-    chol = noise_chol(conditions)
-    covariance = (chol @ chol.mT).expand(*exact.points.shape, 3)
-    with torch.inference_mode():
-        return calibrate_batch(measured, covariance, exact.board_points, exact.valid, conditions.calibration(config))
-
-
-def _joined(batches: Sequence[BatchCalibration]) -> PointRuns:
-    longest = max(len(batch.rmse_path_mm) for batch in batches)
-    paths = [
-        torch.cat([path, path[-1:].expand(longest - len(path), -1)])
-        for path in (batch.rmse_path_mm for batch in batches)
-    ]
-    fields = ("n", "covariance", "iterations", "converged", "noise_scale", "info")
-    return PointRuns(
-        rmse_path_mm=torch.cat(paths, dim=1),
-        **{name: torch.cat([getattr(batch, name) for batch in batches]) for name in fields},
-    )
-
-
 @contextmanager
 def _one_torch_thread() -> Iterator[None]:
-    """Batches are spread over threads; within one, torch's own would only wait for each other."""
+    """One thread for torch: batches run on several threads already, and torch's own would wait for each other."""
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     try:

@@ -1,4 +1,4 @@
-"""The tables of a study: one row a run, one a point, one an iteration of a point."""
+"""The tables of a study: one row per run, one per point, one per iteration of a point."""
 
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -12,48 +12,49 @@ from lsvision.stages.calibration.observability import OBSERVED_SHARE
 from lsvision.study.points import Conditions, ExactCorners, true_information
 from lsvision.study.runs import PointRuns
 
-# Of the RMSE at an iteration, over the runs.
+# Quantiles of the RMSE at an iteration, over the runs.
 _QUANTILES = {"low": 0.05, "median": 0.5, "high": 0.95}
 
 
 def runs_table(
     points: Sequence[Conditions], corners: Sequence[ExactCorners], runs: Sequence[PointRuns]
 ) -> polars.DataFrame:
-    """One row a calibration: n with its error and sigma, RMSE, whether it converged and what it depends on."""
+    """One row per calibration: n with its error and sigma, RMSE, whether it converged, whether its prior decides it."""
     return polars.concat([_run_rows(i, *point) for i, point in enumerate(zip(points, corners, runs, strict=True))])
 
 
 def points_table(
     points: Sequence[Conditions], corners: Sequence[ExactCorners], runs: polars.DataFrame
 ) -> polars.DataFrame:
-    """One row a point: its conditions, and the figures of merit over its runs that gave a result.
+    """One row per point: its conditions, and the figures of merit over its runs that gave a result.
 
-    ``rms_``, ``bias_`` and ``std_`` are of the error of each component of n, ``sigma_`` what the calibrations claim and
-    ``bound_`` the Cramér-Rao bound, prior included. ``error_over_bound`` is the root of the mean squared error in units
-    of the bound, over all components: 1 for an efficient method. ``nees`` is 3 where the claimed covariance is right.
+    ``rms_``, ``bias_`` and ``std_`` are those of the error of each component of n, ``sigma_`` is the mean sigma that
+    the calibrations state, ``bound_`` the Cramér-Rao bound, prior included. ``error_over_bound`` is the root of the
+    mean squared error in units of the bound, over all components: 1 for an efficient method. ``nees`` is 3 where the
+    stated covariance is right.
     """
     rows = []
     for index, (conditions, exact) in enumerate(zip(points, corners, strict=True)):
-        own = runs.filter(polars.col("point") == index)
-        solved = own.filter(polars.col("error_n1").is_finite())
+        of_point = runs.filter(polars.col("point") == index)
+        solved = of_point.filter(polars.col("error_n1").is_finite())
         error = torch.from_numpy(solved.select("error_n1", "error_n2", "error_n3").to_numpy())
         sigma = solved.select("sigma_n1", "sigma_n2", "sigma_n3")
         bound = _bound(exact, conditions)
         scaled = nees(error, torch.linalg.cholesky(bound).expand(len(error), 3, 3))
         row = {"point": index, **asdict(conditions), "board_count": len(exact.points), "corners": exact.valid.numel()}
-        row |= {"tilt_spread_deg": exact.tilt_spread_deg, "depth_span_mm": exact.depth_span_mm, "runs": len(own)}
+        row |= {"tilt_spread_deg": exact.tilt_spread_deg, "depth_span_mm": exact.depth_span_mm, "runs": len(of_point)}
         row |= _by_component("rms", error.square().mean(0).sqrt())
         row |= _by_component("bias", error.mean(0))
         row |= _by_component("std", error.std(0))
         row |= sigma.mean().row(0, named=True)
         row |= _by_component("bound", bound.diagonal().sqrt())
-        row |= {"error_over_bound": float((scaled.mean() / 3).sqrt()), **_means(own, solved)}
+        row |= {"error_over_bound": float((scaled.mean() / 3).sqrt()), **_means(of_point, solved)}
         rows.append(row)
     return polars.DataFrame(rows, infer_schema_length=None)
 
 
 def iterations_table(runs: Sequence[PointRuns]) -> polars.DataFrame:
-    """One row an iteration of a point: quantiles over the runs of the RMSE, mm; iteration 0 is before calibration."""
+    """One row per iteration of a point: quantiles of the RMSE over the runs, mm; iteration 0 is before calibration."""
     rows = []
     for index, point in enumerate(runs):
         quantiles = point.rmse_path_mm.nanquantile(torch.tensor(list(_QUANTILES.values())).double(), dim=1)
@@ -93,11 +94,11 @@ def _bound(corners: ExactCorners, conditions: Conditions) -> Tensor:
     return cramer_rao_bound(true_information(corners, conditions), prior)
 
 
-def _means(own: polars.DataFrame, solved: polars.DataFrame) -> dict[str, float]:
+def _means(of_point: polars.DataFrame, solved: polars.DataFrame) -> dict[str, float]:
     names = ("rmse_before_mm", "rmse_after_mm", "nees", "noise_scale", "converged", "prior_dominated")
     used = polars.col("iterations").cast(polars.Float64).mean().alias("iterations_used")
     means = solved.select(polars.col(names).cast(polars.Float64).mean(), used).row(0, named=True)
-    return {**means, "failed": float(own["failed"].to_numpy().mean())}
+    return {**means, "failed": float(of_point["failed"].to_numpy().mean())}
 
 
 def _columns(prefix: str, values: Tensor) -> dict[str, Tensor]:

@@ -13,7 +13,8 @@ from scipy.optimize import least_squares
 from lsvision.geometry import rotation_from_vector, scan_position, transform
 from lsvision.stages.calibration.calibrate import calibrate
 from lsvision.stages.calibration.config import CalibrationConfig
-from lsvision.stages.calibration.model import nominal_problem, whitened_residuals
+from lsvision.stages.calibration.model import whitened_residuals
+from lsvision.stages.calibration.problem import nominal_problem
 from lsvision.types import Board, BoardCorners, Rig
 
 RIG = Rig(1786, 40.0, 113.84, 354.0, 260.125, 1524.375)

@@ -14,7 +14,7 @@ from filterpy.kalman import CubatureKalmanFilter
 from filterpy.kalman.CubatureKalmanFilter import spherical_radial_sigmas
 from torch import Tensor
 
-from lsvision.estimation import filter_sequence
+from lsvision.estimation import Gaussian, StateSpace, filter_sequence
 
 STEPS = 50
 BATCHES = (1, 100, 1000, 10000)
@@ -94,10 +94,10 @@ def _run_ours(measured: Tensor) -> tuple[float, Tensor]:
     batch = measured.shape[1:-1]
     mean = torch.tensor(MEAN, dtype=torch.float64).expand(*batch, 9)
     chol = torch.diag(torch.tensor(PRIOR_SIGMA, dtype=torch.float64)).expand(*batch, 9, 9)
-    noise, process = NOISE_SIGMA * torch.eye(3).double(), PROCESS_SIGMA * torch.eye(9).double()
+    model = StateSpace(corner, NOISE_SIGMA * torch.eye(3).double(), PROCESS_SIGMA * torch.eye(9).double())
     begin = time.perf_counter()
     with torch.inference_mode():
-        track = filter_sequence(corner, mean, chol, measured, noise, process, history=False)
+        track = filter_sequence(model, Gaussian(mean, chol), measured, history=False)
     return time.perf_counter() - begin, track.means[-1]
 
 

@@ -19,7 +19,7 @@ from lsvision.experiments.settings import build_settings
 from lsvision.experiments.study import StudySettings
 from lsvision.run import config_folder
 from lsvision.study.points import exact_corners, noise_chol
-from lsvision.study.runs import noisy_points, run_points
+from lsvision.study.runs import Sampling, noisy_points, run_points
 
 RUNS, PEER_RUNS, TURNS, THREADS = 2048, 96, 7, 2
 
@@ -64,11 +64,11 @@ def run() -> dict[str, object]:
     peer = Peer(settings)
     measured = noisy_points(peer.corners, peer.point, 0, 0, PEER_RUNS).numpy()
     torch.set_num_threads(1)
-    options = {"batch": settings.batch, "seed": 0, "threads": THREADS}
+    sampling = Sampling(RUNS, settings.batch, seed=0, threads=THREADS)
     ours, theirs, difference = [], [], 0.0
     for _ in range(TURNS):
         begin = time.perf_counter()
-        (found,) = run_points([peer.point], [peer.corners], settings.calibration, runs=RUNS, **options)
+        (found,) = run_points([peer.point], [peer.corners], settings.calibration, sampling)
         ours.append(RUNS / (time.perf_counter() - begin))
         begin = time.perf_counter()
         n = np.stack([peer.calibrate(points)[0] for points in measured])

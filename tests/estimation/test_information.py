@@ -37,8 +37,10 @@ def test_directions_come_weakest_first_with_their_share_of_the_prior():
     """Information 0, 3 and 99 prior weights: posterior sigma 1, 1/2 and 1/10 of the prior's."""
     turn = torch.linalg.qr(random(3, 3)).Q
     information = turn @ torch.diag(torch.tensor([3.0, 99.0, 0.0]).double()) @ turn.mT / 0.05**2
-    vectors, share = weighed_directions(information, 0.05)
-    assert share.tolist() == pytest.approx([1.0, 0.5, 0.1])
+    weighed = weighed_directions(information, 0.05)
+    vectors = weighed.vectors
+    assert weighed.share.tolist() == pytest.approx([1.0, 0.5, 0.1])
     expected = turn[:, [2, 0, 1]].mT
     torch.testing.assert_close((vectors * expected).sum(-1).abs(), torch.ones(3).double())
+    assert torch.equal(weighed.weakest, vectors[0])
     assert (vectors.gather(-1, vectors.abs().argmax(-1, keepdim=True)) > 0).all()

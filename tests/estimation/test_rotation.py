@@ -2,7 +2,7 @@
 
 import torch
 
-from lsvision.estimation import jacobian, recentre
+from lsvision.estimation import Gaussian, jacobian, recentre
 from lsvision.geometry import rotation_from_vector, vector_from_rotation
 from tests.estimation.models import random, random_covariance
 
@@ -10,10 +10,11 @@ from tests.estimation.models import random, random_covariance
 def test_keeps_rotation_and_gaussian():
     nominal, mean = rotation_from_vector(random(4, 3)), random(4, 8)
     chol = torch.linalg.cholesky(random_covariance(4, 8))
-    rotation, centred, factor = recentre(nominal, mean, chol, first=2)
+    rotation, centred = recentre(nominal, Gaussian(mean, chol), first=2)
+    factor = centred.factor
     torch.testing.assert_close(rotation, rotation_from_vector(mean[:, 2:5]) @ nominal)
-    assert (centred[:, 2:5] == 0).all()
-    assert torch.equal(centred[:, [0, 1, 5, 6, 7]], mean[:, [0, 1, 5, 6, 7]])
+    assert (centred.mean[:, 2:5] == 0).all()
+    assert torch.equal(centred.mean[:, [0, 1, 5, 6, 7]], mean[:, [0, 1, 5, 6, 7]])
     assert torch.equal(factor, factor.tril())
     for i in range(4):
 
@@ -29,7 +30,9 @@ def test_keeps_rotation_and_gaussian():
 def test_batch_equals_loop():
     nominal, mean = rotation_from_vector(random(5, 3)), random(5, 6)
     chol = torch.linalg.cholesky(random_covariance(5, 6))
-    together = recentre(nominal, mean, chol, first=0)
+    rotation, state = recentre(nominal, Gaussian(mean, chol), first=0)
     for i in range(5):
-        for part, whole in zip(recentre(nominal[i], mean[i], chol[i], first=0), together, strict=True):
-            torch.testing.assert_close(part, whole[i], rtol=0, atol=1e-14)
+        own_rotation, own_state = recentre(nominal[i], Gaussian(mean[i], chol[i]), first=0)
+        torch.testing.assert_close(own_rotation, rotation[i], rtol=0, atol=1e-14)
+        torch.testing.assert_close(own_state.mean, state.mean[i], rtol=0, atol=1e-14)
+        torch.testing.assert_close(own_state.factor, state.factor[i], rtol=0, atol=1e-14)

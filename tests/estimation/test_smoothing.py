@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from lsvision.estimation import filter_sequence, smooth
+from lsvision.estimation import Gaussian, StateSpace, filter_sequence, smooth
 from tests.estimation.models import random, random_covariance, times
 
 cholesky = torch.linalg.cholesky
@@ -13,8 +13,8 @@ def linear_track(transition, batch=(), steps=6):
     A, z = random(steps, *batch, 2, 3), random(steps, *batch, 2)
     mean, P, Q, R = random(*batch, 3), random_covariance(*batch, 3), random_covariance(*batch, 3), random_covariance(2)
     f = None if transition is None else lambda x: times(transition, x)
-    track = filter_sequence(lambda x, k: times(A[k], x), mean, cholesky(P), z, cholesky(R), cholesky(Q), f)
-    return track, cholesky(Q), f, (A, z, mean, P, Q, R)
+    model = StateSpace(lambda x, k: times(A[k], x), cholesky(R), cholesky(Q), f)
+    return filter_sequence(model, Gaussian(mean, cholesky(P)), z), model, (A, z, mean, P, Q, R)
 
 
 def whole_sequence(A, z, mean, P, Q, R, F):
@@ -39,39 +39,32 @@ def whole_sequence(A, z, mean, P, Q, R, F):
 @pytest.mark.parametrize("walk", [True, False])
 def test_equals_the_dense_gaussian_of_the_whole_sequence(walk):
     F = torch.eye(3).double() if walk else random(3, 3) / 2
-    track, process, f, problem = linear_track(None if walk else F)
-    means, factors = smooth(track, process, f)
+    track, model, problem = linear_track(None if walk else F)
+    found = smooth(track, model)
     expected_means, expected = whole_sequence(*problem, F)
-    torch.testing.assert_close(means, expected_means, rtol=1e-10, atol=1e-10)
-    torch.testing.assert_close(factors @ factors.mT, expected, rtol=1e-9, atol=1e-11)
+    torch.testing.assert_close(found.mean, expected_means, rtol=1e-10, atol=1e-10)
+    torch.testing.assert_close(found.covariance, expected, rtol=1e-9, atol=1e-11)
 
 
 def test_batch_equals_loop():
-    track, process, f, (A, z, mean, P, _, R) = linear_track(random(3, 3) / 2, batch=(4,))
-    means, _ = smooth(track, process, f)
-    alone = filter_sequence(
-        lambda x, k: times(A[k, 2], x), mean[2], cholesky(P[2]), z[:, 2], cholesky(R), process[2], f
-    )
-    torch.testing.assert_close(smooth(alone, process[2], f)[0], means[:, 2], rtol=1e-11, atol=1e-11)
+    track, model, (A, z, mean, P, _, R) = linear_track(random(3, 3) / 2, batch=(4,))
+    means = smooth(track, model).mean
+    single = StateSpace(lambda x, k: times(A[k, 2], x), cholesky(R), model.process_chol[2], model.f)
+    alone = filter_sequence(single, Gaussian(mean[2], cholesky(P[2])), z[:, 2])
+    torch.testing.assert_close(smooth(alone, single).mean, means[:, 2], rtol=1e-11, atol=1e-11)
 
 
 def test_the_last_state_is_the_filtered_one_and_the_others_are_surer():
-    track, process, f, _ = linear_track(None)
-    means, factors = smooth(track, process, f)
-    assert torch.equal(means[-1], track.means[-1])
-    filtered, smoothed = (part.square().sum((-2, -1)) for part in (track.factors, factors))
+    track, model, _ = linear_track(None)
+    found = smooth(track, model)
+    assert torch.equal(found.mean[-1], track.means[-1])
+    filtered, smoothed = (part.square().sum((-2, -1)) for part in (track.factors, found.factor))
     assert (smoothed[:-1] < filtered[:-1]).all()
 
 
 def test_needs_the_history():
-    track = filter_sequence(
-        lambda x, _: x,
-        random(2),
-        torch.eye(2).double(),
-        random(3, 2),
-        torch.eye(2).double(),
-        torch.eye(2).double(),
-        history=False,
-    )
+    eye = torch.eye(2).double()
+    model = StateSpace(lambda x, _: x, eye, eye)
+    track = filter_sequence(model, Gaussian(random(2), eye), random(3, 2), history=False)
     with pytest.raises(ValueError, match="factor for each of 3 steps"):
-        smooth(track, torch.eye(2).double())
+        smooth(track, model)

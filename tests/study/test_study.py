@@ -27,7 +27,7 @@ from lsvision.study.points import (
     true_information,
     true_problem,
 )
-from lsvision.study.runs import noisy_points, run_points
+from lsvision.study.runs import Sampling, noisy_points, run_points
 from lsvision.study.tables import iterations_table, points_table, runs_table
 from lsvision.types import Board
 
@@ -42,7 +42,7 @@ POINT = Conditions("two", angle_x_deg=2.0, angle_z_deg=1.5, stretch=1.0246)
 
 def runs_of(rig, points, *, runs, batch=32, threads=1, seed=0):
     corners = [exact_corners(rig, BOARD, PLACINGS, point) for point in points]
-    found = run_points(points, corners, CalibrationConfig(), runs=runs, batch=batch, seed=seed, threads=threads)
+    found = run_points(points, corners, CalibrationConfig(), Sampling(runs, batch, seed, threads))
     return corners, found
 
 
@@ -80,7 +80,7 @@ def test_noise_is_as_large_as_asked_for(rig):
     error = noisy_points(corners, swinging, 0, 0, 500) - corners.points
     rms = error.square().mean((0, 1, 2)).sqrt()
     torch.testing.assert_close(rms, error.new_tensor([0.3, 0.2, 0.3]), rtol=0.05, atol=0)
-    # Every scan has a phase of its own, all corners of one travel move together.
+    # Every scan has another phase, all corners of one travel move together.
     assert (error[:, 0, 0, 0] - error[:, 1, 0, 0]).abs().max() > 0.1
 
 
@@ -139,7 +139,7 @@ def test_two_steps_contract_slowly_and_the_joint_update_at_once(rig):
     assert table["converged"].to_list() == [1.0, 0.0]
 
 
-def test_iterations_allowed_and_used_are_told_apart(rig):
+def test_iterations_allowed_and_used_are_different_columns(rig):
     points = [dataclasses.replace(POINT, iterations=most) for most in (2, 20)]
     _, table, _ = table_of(rig, points, runs=4)
     assert table["iterations"].to_list() == [2, 20]
@@ -174,7 +174,7 @@ def test_points_are_the_grid_of_the_axes():
 
 
 @pytest.mark.parametrize(
-    ("axes", "told"),
+    ("axes", "message"),
     [
         ({"spam": [1]}, r"axes\.spam: unknown; expected one of boards, "),
         ({"stretch": []}, r"axes\.stretch: the list is empty"),
@@ -182,8 +182,8 @@ def test_points_are_the_grid_of_the_axes():
         ({"method": ["guess"]}, r"axes\.method: 'guess'"),
     ],
 )
-def test_a_wrong_axis_is_named(axes, told):
-    with pytest.raises(ConfigError, match=told):
+def test_a_wrong_axis_is_named(axes, message):
+    with pytest.raises(ConfigError, match=message):
         study_points(POINT, axes)
 
 

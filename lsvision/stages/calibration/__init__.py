@@ -1,1 +1,1 @@
-"""Corners -> calibration: the motion, how well it is known, and what to scan next."""
+"""Corners -> calibration: the motion, how well it is known, and the next scan to make."""

@@ -3,35 +3,33 @@
 All methods hold the prior on n (and on the poses, where one is wanted) fixed and count every corner once.
 """
 
-from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from lsvision.estimation import (
+    Gaussian,
     Info,
+    Linearise,
     Posterior,
+    Prior,
     Rows,
+    StateSpace,
     apply,
     filter_sequence,
     iterated_update,
     levenberg_marquardt,
     nees,
 )
-from lsvision.estimation.joint import Linearise
 from lsvision.stages.calibration.config import CalibrationConfig
-from lsvision.stages.calibration.model import (
-    POINT_SPREAD,
-    BoardProblem,
-    corner_rows,
-    linearise,
-    squared_residuals,
-    whitened_residuals,
-)
+from lsvision.stages.calibration.linearise import corner_rows, linearise, point_factor
+from lsvision.stages.calibration.model import rmse, whitened_residuals
+from lsvision.stages.calibration.problem import BoardProblem
 
-# Standard deviation, rad or mm, of a flat prior where a filter needs a number.
+# Sigma, rad or mm, of a flat prior where a filter needs a number.
 _FLAT = 1e5
 
 
@@ -44,10 +42,8 @@ def joint(problem: BoardProblem, start: Float[Tensor, "*batch state"], config: C
     """Iterated posterior linearisation over all corners of all boards at once."""
     return iterated_update(
         partial(linearise, problem),
-        start,
-        prior_root(start, config),
-        start,
-        _point(start),
+        prior_about(start, config),
+        Gaussian(start, point_factor(start)),
         max_iterations=config.max_iterations,
         tolerance=config.tolerance,
     )
@@ -56,28 +52,29 @@ def joint(problem: BoardProblem, start: Float[Tensor, "*batch state"], config: C
 def two_step(problem: BoardProblem, start: Float[Tensor, "*batch state"], config: CalibrationConfig) -> Posterior:
     """Alternate the boards' poses given n (Step-I) and n given the poses (Step-II) until the RMSE is small enough.
 
-    The covariance is that of all unknowns together at the result: Step-II's own, with the poses held fixed, would claim
+    The covariance is that of all unknowns together at the result: that of Step-II, with the poses fixed, would claim
     directions of n that the boards cannot show.
 
     Source: Wang et al. 2024, Algorithm 1; its step 8 is printed with the inequality the wrong way round.
     """
-    poses, motion = slice(0, start.shape[-1] - 3), slice(start.shape[-1] - 3, start.shape[-1])
+    size = start.shape[-1]
+    poses, motion = slice(0, size - 3), slice(size - 3, size)
+    prior = prior_about(start, config)
     state, path = start, [start]
     running = rmse(problem, start) > config.two_step_threshold_mm
     iterations = torch.zeros_like(running, dtype=torch.long)
     for _ in range(config.two_step_max_iterations):
         if not bool(running.any()):
             break
-        after_poses = _update_part(problem, state, start, poses, config)
-        after_motion = _update_part(problem, after_poses, start, motion, config)
-        state = torch.where(running[..., None], after_motion, state)
+        improved = _updated_part(problem, prior, state, poses, config)  # Step-I: rotations and positions, n fixed
+        improved = _updated_part(problem, prior, improved, motion, config)  # Step-II: n, the poses fixed
+        state = torch.where(running[..., None], improved, state)
         path.append(state)
         iterations = iterations + running
         running = running & (rmse(problem, state) > config.two_step_threshold_mm)
-    factor = _joint_factor(problem, state, prior_root(start, config))
-    info = torch.where(running, int(Info.NOT_CONVERGED), int(Info.OK))
-    info = torch.where(torch.isfinite(factor).all((-2, -1)) & torch.isfinite(state).all(-1), info, int(Info.SINGULAR))
-    return Posterior(state, factor, torch.stack(path), iterations, info == int(Info.OK), info)
+    at_result = Gaussian(state, point_factor(state))
+    factor = iterated_update(partial(linearise, problem), prior, at_result, max_iterations=1).factor
+    return _posterior(Gaussian(state, factor), torch.stack(path), iterations, ~running)
 
 
 def sequential(problem: BoardProblem, start: Float[Tensor, "*batch state"], config: CalibrationConfig) -> Posterior:
@@ -86,23 +83,19 @@ def sequential(problem: BoardProblem, start: Float[Tensor, "*batch state"], conf
     The result is n at the end of the last scan. Each pass filters from the same prior with the corners linearised about
     the pass before: the boards' poses do not move, so that their last state is their smoothed one.
     """
-    rows_order, valid, process = _line_order(problem, config.process_sigma)
-    mean, factor, path = start, _point(start), [start]
+    order = LineOrder.of(problem)
+    process_chol, wide = order.process_chol(config.process_sigma), _wide_chol(start, config)
+    unit = torch.eye(3, dtype=start.dtype, device=start.device)
+    mean, factor, path = start, point_factor(start), [start]
     running = torch.ones_like(start[..., 0], dtype=torch.bool)
     iterations = torch.zeros_like(running, dtype=torch.long)
     for _ in range(config.max_iterations):
-        rows = rows_order(corner_rows(problem, mean, factor))
-        track = filter_sequence(
-            partial(_corner_values, rows[..., :-1]),
-            start - mean,
-            _wide_chol(start, config),
-            rows[..., -1],
-            torch.eye(3, dtype=start.dtype, device=start.device),
-            process,
-            valid=valid,
-            history=False,
-        )
-        new_mean, new_factor = mean + track.means[-1], track.factors[-1]
+        # One pass filters the increments of the state from the pass before.
+        rows = order.sort(corner_rows(problem, mean, factor))
+        model = StateSpace(partial(_corner_values, rows[..., :-1]), noise_chol=unit, process_chol=process_chol)
+        prior = Gaussian(start - mean, wide)
+        increment = filter_sequence(model, prior, rows[..., -1], order.valid, history=False).last
+        new_mean, new_factor = mean + increment.mean, increment.factor
         moved = nees(new_mean - mean, new_factor) / 2
         mean = torch.where(running[..., None], new_mean, mean)
         factor = torch.where(running[..., None, None], new_factor, factor)
@@ -111,103 +104,112 @@ def sequential(problem: BoardProblem, start: Float[Tensor, "*batch state"], conf
         running = running & ~(moved <= config.tolerance)
         if not bool(running.any()):
             break
-    info = torch.where(running, int(Info.NOT_CONVERGED), int(Info.OK))
-    info = torch.where(torch.isfinite(mean).all(-1), info, int(Info.SINGULAR))
-    return Posterior(mean, factor, torch.stack(path), iterations, info == int(Info.OK), info)
+    return _posterior(Gaussian(mean, factor), torch.stack(path), iterations, ~running)
 
 
 def least_squares(problem: BoardProblem, start: Float[Tensor, "*batch state"], config: CalibrationConfig) -> Posterior:
     """Maximum of the posterior by Levenberg-Marquardt on the exact residuals: the reference for the other methods."""
-    root = prior_root(start, config)
+    prior = prior_about(start, config)
 
     def residual(state: Tensor) -> Tensor:
-        from_prior = apply(root, state - start)
-        return torch.cat([whitened_residuals(problem, state), from_prior], dim=-1)
+        """Whitened residuals of the corners, then of the prior."""
+        return torch.cat([whitened_residuals(problem, state), prior.residual(state)], dim=-1)
 
     solution = levenberg_marquardt(residual, start, max_iterations=config.max_iterations)
-    info = torch.where(solution.converged, int(Info.OK), int(Info.NOT_CONVERGED))
-    info = torch.where(torch.isfinite(solution.factor).all((-2, -1)), info, int(Info.SINGULAR))
-    return Posterior(solution.state, solution.factor, solution.path, solution.iterations, solution.converged, info)
-
-
-def prior_root(start: Float[Tensor, "*batch state"], config: CalibrationConfig) -> Float[Tensor, "*batch state state"]:
-    """Information root of the prior: diagonal, zero for what is flat."""
-    boards = (start.shape[-1] - 3) // 6
-    pose = [1 / config.rotation_sigma_rad] * 3 + [1 / config.translation_sigma_mm] * 3
-    diagonal = start.new_tensor(pose * boards + [1 / config.prior_sigma] * 3)
-    return torch.diag(diagonal).expand(*start.shape, start.shape[-1])
-
-
-def rmse(problem: BoardProblem, state: Float[Tensor, "*#batch state"]) -> Float[Tensor, "*batch"]:
-    """Root-mean-square residual over all corners of all boards, mm."""
-    squared = squared_residuals(problem, state).sum(-1)
-    return (squared / problem.valid.sum((-2, -1))).sqrt()
+    result = Gaussian(solution.state, solution.factor)
+    return _posterior(result, solution.path, solution.iterations, solution.converged)
 
 
 METHODS = {"joint": joint, "two_step": two_step, "sequential": sequential, "least_squares": least_squares}
 
 
-def _update_part(problem: BoardProblem, state: Tensor, start: Tensor, part: slice, config: CalibrationConfig) -> Tensor:
-    """The state with one part of it updated by all corners, the rest held; the prior is that of the start."""
-    root = prior_root(start, config)[..., part, part]
-    held = _given_rest(problem, state, part)
-    mean, spread = state[..., part], _point(state)[..., part, part]
+def prior_about(start: Float[Tensor, "*batch state"], config: CalibrationConfig) -> Prior:
+    """The configured prior on n and on the poses about the start; its root is diagonal, zero where it is flat."""
+    boards = (start.shape[-1] - 3) // 6
+    pose = [1 / config.rotation_sigma_rad] * 3 + [1 / config.translation_sigma_mm] * 3
+    diagonal = start.new_tensor(pose * boards + [1 / config.prior_sigma] * 3)
+    return Prior(start, torch.diag(diagonal).expand(*start.shape, start.shape[-1]))
+
+
+@dataclass(frozen=True)
+class LineOrder:
+    """The corners of all boards of a problem in the order in which they are scanned, steps first.
+
+    Boards follow one another; corners that were not seen come last on their board and take no travel.
+    """
+
+    index: Int[Tensor, "*batch boards corners"]
+    valid: Bool[Tensor, "steps *batch"]
+    travel_mm: Float[Tensor, "steps *batch"]
+
+    @classmethod
+    def of(cls, problem: BoardProblem) -> "LineOrder":
+        """The order of a problem's corners, and the travel from each to the next."""
+        travel = torch.where(problem.valid, problem.points[..., 1].abs(), torch.inf)
+        travel, index = travel.sort(dim=-1)
+        between = torch.nn.functional.pad(travel.diff(dim=-1), (1, 0)).flatten(-2).movedim(-1, 0)
+        valid = _sorted(problem.valid, index)
+        return cls(index, valid, torch.where(valid, between, 0.0))
+
+    def sort(
+        self, values: Float[Tensor, "*batch boards corners rows columns"]
+    ) -> Float[Tensor, "steps *batch rows columns"]:
+        """Values of all corners in line order."""
+        return _sorted(values, self.index)
+
+    def process_chol(self, sigma: float) -> Float[Tensor, "steps *batch state state"]:
+        """√Q of an n that walks at random by ``sigma`` per square root of a mm; the poses stand still."""
+        walk = sigma * self.travel_mm.sqrt()
+        moving = torch.cat([walk.new_zeros(6 * self.index.shape[-2]), walk.new_ones(3)])
+        return torch.diag_embed(walk[..., None] * moving)
+
+
+def _sorted(values: Tensor, index: Tensor) -> Tensor:
+    """``(*batch, boards, corners, ..)`` by an index ``(*batch, boards, corners)``, as ``(steps, *batch, ..)``."""
+    batch = index.ndim - 2
+    by_value = index.reshape(*index.shape, *(1,) * (values.ndim - index.ndim)).expand_as(values)
+    return values.gather(batch + 1, by_value).flatten(batch, batch + 1).movedim(batch, 0)
+
+
+def _corner_values(A: Tensor, points: Tensor, step: int) -> Tensor:
+    """Linearised corner of a step; the points are copied, so that sums take one order (see ``estimation.linalg``)."""
+    return apply(A[step], points.contiguous())
+
+
+def _wide_chol(start: Tensor, config: CalibrationConfig) -> Tensor:
+    """Cholesky factor of the prior; a flat part gets a sigma so wide that its weight is lost in rounding."""
+    sigma = prior_about(start, config).root.diagonal(dim1=-2, dim2=-1).clamp(min=1 / _FLAT).reciprocal()
+    return torch.diag_embed(sigma)
+
+
+def _updated_part(problem: BoardProblem, prior: Prior, state: Tensor, part: slice, config: CalibrationConfig) -> Tensor:
+    """The state with one part of it updated by all corners and the prior, the rest fixed."""
     posterior = iterated_update(
-        held, start[..., part], root, mean, spread, max_iterations=config.max_iterations, tolerance=config.tolerance
+        _given_rest(problem, state, part),
+        Prior(prior.mean[..., part], prior.root[..., part, part]),
+        Gaussian(state[..., part], point_factor(state)[..., part, part]),
+        max_iterations=config.max_iterations,
+        tolerance=config.tolerance,
     )
     return torch.cat([state[..., : part.start], posterior.mean, state[..., part.stop :]], dim=-1)
 
 
 def _given_rest(problem: BoardProblem, state: Tensor, part: slice) -> Linearise:
-    """Linearisation in one part of the state, the rest known to be what it is."""
+    """Linearisation in one part of the state, the rest fixed."""
 
     def rows(mean: Tensor, factor: Tensor) -> Rows:
-        """Rows of the whole state, as seen by the part."""
-        full, spread = state.clone(), _point(state).clone()
-        full[..., part], spread[..., part, part] = mean, factor
-        whole = linearise(problem, full, spread)
+        """Rows of the whole state, with the columns of the part alone."""
+        whole_mean, whole_factor = state.clone(), point_factor(state).clone()
+        whole_mean[..., part], whole_factor[..., part, part] = mean, factor
+        whole = linearise(problem, whole_mean, whole_factor)
         return Rows(torch.cat([whole.matrix[..., part], whole.matrix[..., -1:]], -1), whole.log_det)
 
     return rows
 
 
-def _line_order(problem: BoardProblem, sigma: float) -> tuple[Callable[[Tensor], Tensor], Tensor, Tensor]:
-    """How to put corners, ``(*batch, boards, corners, ..)``, in line order, steps first; which are valid; √Q of n.
-
-    Corners that were not seen come last on their board and take no travel.
-    """
-    travel = torch.where(problem.valid, problem.points[..., 1].abs(), torch.inf)
-    travel, order = travel.sort(dim=-1)
-    batch = problem.valid.ndim - 2
-
-    def reorder(values: Tensor) -> Tensor:
-        index = order.reshape(*order.shape, *(1,) * (values.ndim - order.ndim)).expand_as(values)
-        return values.gather(batch + 1, index).flatten(batch, batch + 1).movedim(batch, 0)
-
-    valid = reorder(problem.valid)
-    between = torch.nn.functional.pad(travel.diff(dim=-1), (1, 0)).flatten(-2).movedim(-1, 0)
-    spread = sigma * torch.where(valid, between, 0.0).sqrt()
-    moving = torch.cat([spread.new_zeros(6 * problem.boards), spread.new_ones(3)])
-    return reorder, valid, torch.diag_embed(spread[..., None] * moving)
-
-
-def _corner_values(A: Tensor, points: Tensor, step: int) -> Tensor:
-    """Linearised corner of a step; the points are copied so that sums run alike for one problem and for many."""
-    return apply(A[step], points.contiguous())
-
-
-def _wide_chol(start: Tensor, config: CalibrationConfig) -> Tensor:
-    """Cholesky factor of the prior; what is flat becomes so wide that its weight is lost in rounding."""
-    spread = prior_root(start, config).diagonal(dim1=-2, dim2=-1).clamp(min=1 / _FLAT).reciprocal()
-    return torch.diag_embed(spread)
-
-
-def _joint_factor(problem: BoardProblem, state: Tensor, root: Tensor) -> Tensor:
-    """Covariance factor of all unknowns, the model linearised at a point."""
-    return iterated_update(partial(linearise, problem), state, root, state, _point(state), max_iterations=1).factor
-
-
-def _point(state: Tensor) -> Tensor:
-    """Factor of a Gaussian so narrow that linearising about it is linearising at its mean."""
-    eye = torch.eye(state.shape[-1], dtype=state.dtype, device=state.device)
-    return (POINT_SPREAD * eye).expand(*state.shape, state.shape[-1])
+def _posterior(result: Gaussian, path: Tensor, iterations: Tensor, converged: Tensor) -> Posterior:
+    """The result with its status: singular where it is not finite."""
+    finite = torch.isfinite(result.factor).all((-2, -1)) & torch.isfinite(result.mean).all(-1)
+    info = torch.where(converged, int(Info.OK), int(Info.NOT_CONVERGED))
+    info = torch.where(finite, info, int(Info.SINGULAR))
+    return Posterior(result.mean, result.factor, path, iterations, info == int(Info.OK), info)

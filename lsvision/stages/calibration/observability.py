@@ -1,27 +1,29 @@
 """Which directions of n the boards determine, and which board tilt to scan next.
 
 The measure is the Fisher information of the corners on n, the boards' poses unknown and without the prior, in units of
-the prior's sigma: an eigenvalue λ says that the data weigh λ times as much as the prior along its direction.
+the prior's sigma: the data weigh λ times as much as the prior along the direction of an eigenvalue λ.
 """
 
-from dataclasses import replace
+from collections.abc import Sequence
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from lsvision.estimation import weighed_directions
-from lsvision.geometry import rotation_from_vector, scan_position, transform
-from lsvision.stages.calibration.model import BoardProblem, join_state, motion_information, rotations, split_state
+from lsvision.geometry import euler_angles, rotation_from_vector, scan_position, transform
+from lsvision.stages.calibration.linearise import motion_information
+from lsvision.stages.calibration.model import rotations
+from lsvision.stages.calibration.problem import BoardProblem, BoardState
 from lsvision.types import Observability, ObservedDirection
 
 # A direction counts as observed where the data weigh at least three times as much as the prior: the posterior sigma is
 # then at most half the prior's.
 OBSERVED_SHARE = 0.5
-# Tilts to choose from. Past 15 degrees the inner corners of a 360 x 270 mm board leave a depth range of 52 mm.
+# Tilts to choose from. Past 15 degrees the inner corners of a 360 x 270 mm board exceed a depth range of 52 mm.
 TILT_GRID_DEG = (-15.0, -10.0, 0.0, 10.0, 15.0)
 
-_NEARLY_ONE = 0.95  # a direction is named after its component alone where that makes up this much of its length
+_NEARLY_ONE = 0.95  # a direction is named after its component alone where that is this much of its length
 _AXES = ("n1 (sideways)", "n2 (stretch)", "n3 (in depth)")
 
 
@@ -32,14 +34,14 @@ def observe(
 
     Args:
         state: solution of the problem, whose batch shape is ().
-        prior_sigma: standard deviation of each component of n before the scans.
-        noise_scale: factor on the covariance of the corners that their residuals ask for.
+        prior_sigma: sigma of each component of n before the scans.
+        noise_scale: factor on the corners' covariance that their residuals ask for.
     """
     information = motion_information(problem, state) / noise_scale
-    vectors, share = weighed_directions(information, prior_sigma)
+    weighed = weighed_directions(information, prior_sigma)
     directions = tuple(
-        ObservedDirection(_components(vector), prior_sigma, prior_sigma * float(part), bool(part < OBSERVED_SHARE))
-        for vector, part in zip(vectors, share, strict=True)
+        _observed_direction(vector.tolist(), float(share), prior_sigma)
+        for vector, share in zip(weighed.vectors, weighed.share, strict=True)
     )
     missing = [direction for direction in directions if not direction.observed]
     about_x, about_y = next_tilt(problem, state, prior_sigma, noise_scale)
@@ -56,12 +58,13 @@ def next_tilt(
 ) -> tuple[float, float]:
     """Tilt of the next board scan (about the sensor axis X, about the travel axis Y), deg, that helps most.
 
-    It is the tilt of the grid whose scan, simulated with the corners and noise of the first board, leaves the smallest
-    posterior sigma along the direction that is weakest now. Of tilts that do equally well the smallest is taken.
+    It is the tilt of the grid whose scan, simulated with the corners and noise of the first board, makes the posterior
+    sigma along the direction that is weakest now the smallest. Of equally good tilts it is the smallest.
     """
     information = motion_information(problem, state) / noise_scale
-    weakest = weighed_directions(information, prior_sigma)[0][0]
-    tilts = _tilt_grid(state)
+    weakest = weighed_directions(information, prior_sigma).weakest
+    grid = state.new_tensor(TILT_GRID_DEG)
+    tilts = torch.cartesian_prod(grid, grid)
     gained = information + simulated_information(problem, state, tilts) / noise_scale
     precision = gained + torch.eye(3, dtype=state.dtype, device=state.device) / prior_sigma**2
     variance = (weakest * torch.linalg.solve(precision, weakest.expand(len(tilts), 3))).sum(-1)
@@ -74,39 +77,34 @@ def simulated_information(
     problem: BoardProblem, state: Float[Tensor, " state"], tilts_deg: Float[Tensor, "tilts 2"]
 ) -> Float[Tensor, "tilts 3 3"]:
     """Fisher information on n of one more scan of the first board, tilted about X and Y from lying flat."""
-    _, position, n = split_state(state)
-    count = len(tilts_deg)
+    now, count = BoardState.split(state), len(tilts_deg)
     about_x, about_y = (
         rotation_from_vector(angle[:, None] * axis)
         for angle, axis in zip(tilts_deg.deg2rad().unbind(-1), torch.eye(3).to(state), strict=False)
     )
     rotation = (about_x @ about_y @ _without_tilt(rotations(problem, state)[0]))[:, None]
-    body, position = problem.body_points[:1].expand(count, 1, -1, 3), position[:1].expand(count, 1, 3)
-    simulated = replace(
-        problem,
-        points=scan_position(transform(rotation, position, body), n),
+    body, position = problem.body_points[:1].expand(count, 1, -1, 3), now.position[:1].expand(count, 1, 3)
+    simulated = BoardProblem(
+        points=scan_position(transform(rotation, position, body), now.n),
         noise_chol=problem.noise_chol[:1].expand(count, 1, -1, 3, 3),
         body_points=body,
+        centroid=problem.centroid[:1].expand(count, 1, 3),
         valid=problem.valid[:1].expand(count, 1, -1),
         rotation=rotation,
-        pitch=None,
     )
-    return motion_information(simulated, join_state(torch.zeros_like(position), position, n.expand(count, 3)))
+    untilted = BoardState(torch.zeros_like(position), position, now.n.expand(count, 3))
+    return motion_information(simulated, untilted.join())
 
 
 def _without_tilt(rotation: Tensor) -> Tensor:
-    """A board's rotation about the viewing direction alone."""
-    heading = torch.atan2(rotation[1, 0], rotation[0, 0])
+    """The part of a board's rotation about the viewing direction, ``(3, 3)``."""
+    _, _, heading = euler_angles(rotation)
     return rotation_from_vector(heading * rotation.new_tensor([0.0, 0.0, 1.0]))
 
 
-def _tilt_grid(state: Tensor) -> Tensor:
-    return torch.cartesian_prod(state.new_tensor(TILT_GRID_DEG), state.new_tensor(TILT_GRID_DEG))
-
-
-def _components(vector: Tensor) -> tuple[float, float, float]:
-    n1, n2, n3 = vector.tolist()
-    return n1, n2, n3
+def _observed_direction(vector: Sequence[float], share: float, prior_sigma: float) -> ObservedDirection:
+    n1, n2, n3 = vector
+    return ObservedDirection((n1, n2, n3), prior_sigma, prior_sigma * share, share < OBSERVED_SHARE)
 
 
 def _direction_in_words(direction: ObservedDirection) -> str:

@@ -6,7 +6,7 @@ s / n2 of travel later and in another column (``ProductFrame.shifted_column``).
 
 import math
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
@@ -21,6 +21,7 @@ _GREEN = 1
 _COARSE_FROM = 1.25  # distance of cells, in pixels, from which on smoothing does more good than harm
 
 
+@runtime_checkable
 class Sampling(Protocol):
     """How colours are interpolated."""
 

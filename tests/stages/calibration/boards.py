@@ -1,4 +1,4 @@
-"""Synthetic corners of tilted boards, with noise as given or none."""
+"""Synthetic corners of tilted boards, with noise as given or without."""
 
 import math
 from dataclasses import dataclass, replace
@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from lsvision.geometry import rotation_from_vector, scan_position, transform
-from lsvision.stages.calibration.model import BoardProblem, nominal_problem
+from lsvision.stages.calibration.problem import BoardProblem, nominal_problem
 from lsvision.types import Board, BoardCorners, Rig
 
 RIG = Rig(1786, 40.0, 113.84, 354.0, 260.125, 1524.375)
@@ -47,7 +47,7 @@ class Corners:
         return nominal_problem(self.points, torch.linalg.cholesky(self.covariance), self.board_points, self.valid)
 
     def boards(self) -> list[BoardCorners]:
-        """One BoardCorners a board."""
+        """One BoardCorners per board."""
         fields = (self.points, self.covariance, self.valid, self.board_points)
         return [
             BoardCorners(f"scan_{i}", points, covariance, valid, board_points, points[:, :2])
@@ -64,15 +64,15 @@ def simulate(
     rotation = torch.stack([tilt(*angles) for angles in tilts])
     translation = torch.tensor(origin, dtype=torch.float64).expand(len(tilts), 3)
     exact = scan_position(transform(rotation, translation, body), n)
-    spread = torch.tensor(sigma, dtype=torch.float64)
-    points = exact + spread * torch.randn(*batch, *exact.shape, dtype=torch.float64)
-    covariance = torch.diag(spread.clamp(min=1e-6) ** 2).expand(*points.shape, 3)
+    sigmas = torch.tensor(sigma, dtype=torch.float64)
+    points = exact + sigmas * torch.randn(*batch, *exact.shape, dtype=torch.float64)
+    covariance = torch.diag(sigmas.clamp(min=1e-6) ** 2).expand(*points.shape, 3)
     valid = torch.ones(points.shape[:-1], dtype=torch.bool)
     return Corners(points, covariance, body.expand_as(points), valid, n, rotation, translation)
 
 
 def thinned(corners: Corners) -> Corners:
-    """Every ninth corner of each board: ten that span it, for what is slow with all."""
+    """Every ninth corner of each board: ten that span it, for tests that are slow with all."""
     return replace(
         corners,
         points=corners.points[..., ::9, :].clone(),

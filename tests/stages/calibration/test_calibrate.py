@@ -1,4 +1,4 @@
-"""Calibration from corners: all methods, what they say of themselves, and bad data."""
+"""Calibration from corners: all methods, the uncertainty they state, and bad data."""
 
 import itertools
 import math

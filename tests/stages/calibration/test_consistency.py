@@ -1,7 +1,7 @@
 """Simulated calibrations of three tilts with matched noise: errors as large as claimed, and as small as can be.
 
-The ratio to the bound scatters by 3.5 % over 400 runs, too much for bounds of -5 % and +6 %; so there are four times as
-many, of fewer corners each.
+The ratio to the bound has a sigma of 3.5 % over 400 runs, too much for bounds of -5 % and +6 %: so 1600 runs are made,
+of fewer corners each.
 """
 
 from functools import cache
@@ -12,8 +12,9 @@ import torch
 from lsvision.estimation import cramer_rao_bound, fisher_information, mean_chi_square_band, nees
 from lsvision.geometry import vector_from_rotation
 from lsvision.stages.calibration.config import CalibrationConfig
-from lsvision.stages.calibration.methods import joint, prior_root
-from lsvision.stages.calibration.model import BoardProblem, join_state, rotations, split_state, whitened_residuals
+from lsvision.stages.calibration.methods import joint, prior_about
+from lsvision.stages.calibration.model import rotations, whitened_residuals
+from lsvision.stages.calibration.problem import BoardProblem, BoardState
 from tests.stages.calibration.boards import simulate, thinned
 
 RUNS = 1600
@@ -28,16 +29,16 @@ def runs(rotation_sigma: float):
     problem, start = corners.problem()
     posterior = joint(problem, start, config)
     assert posterior.converged.all()
-    theta, position, n = split_state(posterior.mean)
+    found = BoardState.split(posterior.mean)
     true_theta = vector_from_rotation(corners.rotation @ problem.rotation.mT)
     true_position = (corners.rotation @ problem.centroid[0][..., None])[..., 0] + corners.translation
-    errors = join_state(theta - true_theta, position - true_position, n - corners.n)
-    truth = join_state(true_theta[0], true_position, corners.n)
+    errors = BoardState(found.theta - true_theta, found.position - true_position, found.n - corners.n).join()
+    truth = BoardState(true_theta[0], true_position, corners.n).join()
     names = ("points", "noise_chol", "body_points", "centroid", "valid", "rotation")
     one = BoardProblem(*(getattr(problem, name)[0] for name in names))
     torch.testing.assert_close(rotations(one, truth), corners.rotation)
     information = fisher_information(lambda x: whitened_residuals(one, x), truth)
-    root = prior_root(start[0], config)
+    root = prior_about(start[0], config).root
     return errors, posterior.factor, cramer_rao_bound(information, root.mT @ root)
 
 

@@ -1,4 +1,4 @@
-"""What boards cannot show is named, and the tilt proposed is the one that helps most."""
+"""Directions that boards cannot show are named, and the tilt proposed is the one that helps most."""
 
 from dataclasses import replace
 
@@ -8,12 +8,13 @@ import torch
 from lsvision.estimation import weighed_directions
 from lsvision.stages.calibration.calibrate import calibrate
 from lsvision.stages.calibration.config import CalibrationConfig
+from lsvision.stages.calibration.linearise import motion_information
 from lsvision.stages.calibration.methods import joint
-from lsvision.stages.calibration.model import join_state, motion_information, split_state
 from lsvision.stages.calibration.observability import TILT_GRID_DEG, next_tilt, simulated_information
+from lsvision.stages.calibration.problem import BoardState
 from tests.stages.calibration.boards import RIG, simulate, true_motion
 
-LEVEL = true_motion(pitch_deg=0.0)  # where the prior's mean of what one tilt leaves open is the truth
+LEVEL = true_motion(pitch_deg=0.0)  # the prior's mean is the truth along the direction that one tilt cannot show
 
 
 def report(tilts):
@@ -30,7 +31,7 @@ def report(tilts):
     ],
     ids=["one flat board", "one tilted board", "flat boards turned in plane", "repeats of a tilt"],
 )
-def test_what_a_single_tilt_leaves_open_is_n3(tilts):
+def test_a_single_tilt_does_not_show_n3(tilts):
     found = report(tilts)
     assert found.verdict == "prior-dominated"
     assert [direction.observed for direction in found.directions] == [False, True, True]
@@ -68,7 +69,7 @@ def test_the_proposed_tilt_lowers_the_sigma_most_when_it_is_scanned(first):
     problem, start = simulate([first], n=LEVEL).problem()
     state = joint(problem, start, CalibrationConfig()).mean
     proposal = next_tilt(problem, state, 0.05)
-    weakest = weighed_directions(motion_information(problem, state), 0.05)[0][0]
+    weakest = weighed_directions(motion_information(problem, state), 0.05).weakest
     sigma = {(x, y): posterior_sigma([first, (x, y, 0.0)], weakest) for x in TILT_GRID_DEG for y in TILT_GRID_DEG}
     assert sigma[proposal] <= 1.002 * min(sigma.values())
     assert sigma[proposal] < 0.01 * 0.05
@@ -76,12 +77,12 @@ def test_the_proposed_tilt_lowers_the_sigma_most_when_it_is_scanned(first):
 
 def test_simulated_information_is_that_of_a_scan_at_that_tilt():
     problem, start = simulate([(0.0, 0.0, 0.0)]).problem()
-    _, position, n = split_state(start)
+    now = BoardState.split(start)
     found = simulated_information(problem, start, torch.tensor([[10.0, -5.0], [0.0, 0.0]]).double())
-    exact = simulate([(10.0, -5.0, 0.0)], sigma=(0.0, 0.0, 0.0), n=n, origin=(20.0, 60.0, 800.0))
+    exact = simulate([(10.0, -5.0, 0.0)], sigma=(0.0, 0.0, 0.0), n=now.n, origin=(20.0, 60.0, 800.0))
     scanned, _ = exact.problem()
-    at = join_state(torch.zeros(1, 3).double(), position, n)
+    at = BoardState(torch.zeros(1, 3).double(), now.position, now.n).join()
     scanned = replace(scanned, noise_chol=problem.noise_chol, rotation=exact.rotation)
     expected = motion_information(scanned, at)
     assert (found[0] - expected).norm() / expected.norm() < 0.1
-    assert weighed_directions(found[1], 0.05)[1][0] == pytest.approx(1.0, abs=1e-6)
+    assert weighed_directions(found[1], 0.05).share[0] == pytest.approx(1.0, abs=1e-6)

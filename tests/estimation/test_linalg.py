@@ -1,11 +1,19 @@
-"""Reflections over a whole batch against LAPACK, one matrix at a time."""
+"""Linear algebra of batches: LAPACK one matrix at a time, and the same bits alone and in a batch."""
 
 import pytest
 import torch
 
-from lsvision.estimation.square_root import absorb, forward_substitute, ordered_sum
-from lsvision.estimation.triangular import lower_factor, solve_upper, upper_root
-from tests.estimation.models import random, random_covariance
+from lsvision.estimation.linalg import (
+    absorb,
+    apply,
+    forward_substitute,
+    lower_factor,
+    ordered_sum,
+    product,
+    solve_upper,
+    upper_root,
+)
+from tests.estimation.models import random, random_covariance, times
 
 
 def batch_last(matrix: torch.Tensor) -> torch.Tensor:
@@ -72,3 +80,13 @@ def test_lapack_roots_do_not_depend_on_the_batch():
         alone = matrix[i].clone()
         assert torch.equal(upper_root(alone), root[i])
         assert torch.equal(solve_upper(upper_root(alone), eye), inverse[i])
+
+
+def test_products_are_products_and_do_not_depend_on_the_batch():
+    left, right, vector = random(9, 5, 13), random(9, 13, 4), random(9, 13)
+    whole, applied = product(left, right), apply(left, vector)
+    torch.testing.assert_close(whole, left @ right)
+    torch.testing.assert_close(applied, times(left, vector))
+    for i in range(9):
+        assert torch.equal(product(left[i].clone(), right[i].clone()), whole[i])
+        assert torch.equal(apply(left[i].clone(), vector[i].clone()), applied[i])

@@ -1,0 +1,62 @@
+"""Corners of a board, reduced once to a few rows on which the calibration's kernels work: exact, whatever their number.
+
+Both reductions are the triangular root of rows over all corners, so that sums of squares of anything linear in those
+rows stay the same. They buy speed: an iteration costs the same for 88 corners as for 10.
+"""
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from lsvision.estimation import upper_root
+from lsvision.estimation.linalg import forward_substitute
+
+# Boards whose whitened corners are reduced at once: some 2 MB, as much as stays near a processor.
+_BOARDS_IN_CACHE = 64
+
+
+def affine_rows(
+    noise_chol: Float[Tensor, "*batch boards corners 3 3"],
+    points: Float[Tensor, "*batch boards corners 3"],
+    body_points: Float[Tensor, "*batch boards corners 3"],
+    valid: Bool[Tensor, "*batch boards corners"],
+) -> Float[Tensor, "*batch boards 13 13"]:
+    """Whitened rows ``[S | q]`` on the affine map from board points to measured ones.
+
+    For the map's twelve coefficients c, its three values at p = 0, then its derivatives by each component of p,
+    ‖q - S c‖² is the squared whitened error of all valid corners.
+
+    Args:
+        noise_chol: Cholesky factor of the covariance of ``points``, mm.
+    """
+    parts = (noise_chol, points, body_points, valid)
+    if valid.ndim < 3:
+        return _affine_rows(*parts)
+    step = max(1, _BOARDS_IN_CACHE // points.shape[-3])
+    return torch.cat([_affine_rows(*pieces) for pieces in zip(*(part.split(step) for part in parts), strict=True)])
+
+
+def residual_rows(
+    points: Float[Tensor, "*batch boards corners 3"],
+    body_points: Float[Tensor, "*batch boards corners 3"],
+    valid: Bool[Tensor, "*batch boards corners"],
+) -> Float[Tensor, "*batch boards 7 7"]:
+    """Rows of (1, p, x, y, z) of the valid corners, on which the sum of their squared residuals depends alone."""
+    rows = torch.cat([torch.ones_like(points[..., :1]), body_points, points], dim=-1)
+    return upper_root(torch.where(valid[..., None], rows, 0.0))
+
+
+def _affine_rows(noise_chol: Tensor, points: Tensor, body_points: Tensor, valid: Tensor) -> Tensor:
+    eye = torch.eye(3, dtype=points.dtype, device=points.device)
+    eye = eye.reshape(3, 3, *(1,) * valid.ndim).expand(3, 3, *valid.shape)
+    right = torch.cat([eye, points.movedim(-1, 0)[:, None]], dim=1)
+    whitened = forward_substitute(noise_chol.movedim((-2, -1), (0, 1)), right)
+    # Whitener and whitened points as (*batch, boards, column, row, corner): corners side by side in memory.
+    whitened = torch.where(valid, whitened, 0.0).movedim((1, 0), (-3, -2))
+    columns = points.new_empty(*whitened.shape[:-3], 13, *whitened.shape[-2:])
+    columns[..., :3, :, :], columns[..., 12, :, :] = whitened[..., :3, :, :], whitened[..., 3, :, :]
+    for k, component in enumerate(body_points.unbind(-1)):
+        by_point = columns[..., 3 + 3 * k : 6 + 3 * k, :, :]
+        torch.mul(whitened[..., :3, :, :], component[..., None, None, :], out=by_point)
+    # In one layout whatever comes before: the order of sums, and so their last bits, follows it.
+    return upper_root(columns.flatten(-2).mT).contiguous()
