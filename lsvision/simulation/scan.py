@@ -12,6 +12,7 @@ from torch import Tensor
 
 from lsvision.errors import ConfigError
 from lsvision.geometry import project
+from lsvision.schema import Positive, PositiveInt, check, option_fault
 from lsvision.simulation.config import EncoderConfig, MotionConfig, SceneConfig, SensorConfig
 from lsvision.simulation.noise import lattice_hash
 from lsvision.simulation.scene import build_scene, place, scene_lines
@@ -157,7 +158,8 @@ def simulate(
     Raises:
         ConfigError: an option that no scan can be made with; the message names it.
     """
-    _check(scene, sensor, motion, line_pitch_mm, lines)
+    check(Positive, line_pitch_mm, "line_pitch_mm", option_fault)
+    check(PositiveInt | None, lines, "lines", option_fault)
     trajectory = Trajectory(rig, motion, encoder or EncoderConfig(), line_pitch_mm, transport)
     if lines is None:
         lines = scene_lines(board, scene, trajectory.n, line_pitch_mm)
@@ -197,28 +199,6 @@ def _logged_travel(trajectory: Trajectory, lines: int) -> Travel:
             "encoder.wobble_mm, encoder.noise_mm: so uneven that the log runs backwards at this line pitch"
         )
     return Travel(pitch, log, trajectory.transport)
-
-
-def _check(
-    scene: SceneConfig, sensor: SensorConfig, motion: MotionConfig, line_pitch_mm: float, lines: int | None
-) -> None:
-    problems = {
-        "line_pitch_mm: must be positive": line_pitch_mm > 0,
-        "lines: must be at least 1": lines is None or lines >= 1,
-        "scene.kind: must be board, sheet or rail": scene.kind in ("board", "sheet", "rail"),
-        "scene.texture_mm: must be positive": scene.texture_mm > 0,
-        "scene: a rail runs along the motion; pitch_deg and yaw_deg must be 0": scene.kind != "rail"
-        or (scene.pitch_deg == 0 and scene.yaw_deg == 0),
-        "sensor.bits: must be 8 or 16": sensor.bits in (8, 16),
-        "sensor.supersampling: must be at least 1": sensor.supersampling >= 1,
-        "sensor.blur_px: must not be negative": sensor.blur_px >= 0,
-        "motion.stretch: must be positive": motion.stretch > 0,
-        "motion.vibration_wavelengths_mm: must hold positive lengths": bool(motion.vibration_wavelengths_mm)
-        and min(motion.vibration_wavelengths_mm) > 0,
-    }
-    for problem, fine in problems.items():
-        if not fine:
-            raise ConfigError(problem)
 
 
 def _regroup(blocks: Iterator[Tensor], strip_lines: int, total: int) -> Iterator[Tensor]:

@@ -4,12 +4,13 @@ import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
+from typing import Any
 
-import dacite
 import torch
 from torch import Tensor
 
 from lsvision.errors import ConfigError
+from lsvision.schema import AcuteAngle, Checked, NonNegative, OptionError, Positive, PositiveInt, Text
 from lsvision.simulation import BoardPose, MotionConfig, SceneConfig, SensorConfig, Simulation, simulate
 from lsvision.stages.calibration.config import CalibrationConfig
 from lsvision.stages.calibration.model import BoardProblem, join_state, motion_information, nominal_problem
@@ -20,7 +21,7 @@ _LINE_PITCH_MM = 0.07
 
 
 @dataclass(frozen=True)
-class Conditions:
+class Conditions(Checked):
     """One point of a study: the boards' placing, the installation, what disturbs the corners, and how n is estimated.
 
     ``corner_sigma_mm`` is the white noise of x and of the travel, ``depth_sigma_mm`` that of z; the calibration knows
@@ -28,19 +29,19 @@ class Conditions:
     in every scan, given as rms values.
     """
 
-    boards: str
-    angle_x_deg: float = 0.0
-    angle_z_deg: float = 0.0
-    stretch: float = 1.0
-    corner_sigma_mm: float = 0.02
-    depth_sigma_mm: float = 0.014
-    vibration_mm: float = 0.0
-    vibration_wavelength_mm: float = 100.0
-    encoder_mm: float = 0.0
-    encoder_wavelength_mm: float = 400.0
-    prior_sigma: float = 0.05
+    boards: Text
+    angle_x_deg: AcuteAngle = 0.0
+    angle_z_deg: AcuteAngle = 0.0
+    stretch: Positive = 1.0
+    corner_sigma_mm: Positive = 0.02
+    depth_sigma_mm: Positive = 0.014
+    vibration_mm: NonNegative = 0.0
+    vibration_wavelength_mm: Positive = 100.0
+    encoder_mm: NonNegative = 0.0
+    encoder_wavelength_mm: Positive = 400.0
+    prior_sigma: Positive = 0.05
     method: CalibrationMethod = "joint"
-    iterations: int = 20
+    iterations: PositiveInt = 20
 
     def calibration(self, config: CalibrationConfig) -> CalibrationConfig:
         """The calibration's options with those of this point."""
@@ -85,7 +86,7 @@ def study_points(base: Conditions, axes: Mapping[str, Sequence[float | str] | No
     """The grid of all axes, the last one fastest, over the base's conditions; an axis of None stays at its value.
 
     Raises:
-        ConfigError: an axis that is no condition, is empty, or a value of the wrong type.
+        ConfigError: an axis that is no condition, is empty, or holds a value that the condition cannot have.
     """
     known = [item.name for item in fields(Conditions)]
     varied = {name: values for name, values in axes.items() if values is not None}
@@ -94,11 +95,13 @@ def study_points(base: Conditions, axes: Mapping[str, Sequence[float | str] | No
             raise ConfigError(f"axes.{name}: unknown; expected one of {', '.join(known)}")
         if not values:
             raise ConfigError(f"axes.{name}: the list is empty")
-    combinations = [dict(zip(varied, values, strict=True)) for values in itertools.product(*varied.values())]
+    combinations: list[dict[str, Any]] = [
+        dict(zip(varied, values, strict=True)) for values in itertools.product(*varied.values())
+    ]
     try:
-        return [dacite.from_dict(Conditions, {**asdict(base), **values}) for values in combinations]
-    except dacite.WrongTypeError as error:
-        raise ConfigError(f"axes.{error.field_path}: {error.value!r} is not a value of it") from error
+        return [replace(base, **values) for values in combinations]
+    except OptionError as error:
+        raise ConfigError(f"axes.{error.key}: {error.problem}") from error
 
 
 def exact_corners(
@@ -129,11 +132,8 @@ def exact_corners(
 
 
 def noise_chol(conditions: Conditions) -> Tensor:
-    """Cholesky factor of the covariance that the calibration is told, ``(3, 3)`` mm."""
+    """Cholesky factor of the covariance that the calibration works with, ``(3, 3)`` mm."""
     corner, depth = conditions.corner_sigma_mm, conditions.depth_sigma_mm
-    for name, value in (("corner_sigma_mm", corner), ("depth_sigma_mm", depth)):
-        if not value > 0:
-            raise ConfigError(f"{name}: expected a positive number, got {value}")
     return torch.diag(torch.tensor([corner, corner, depth], dtype=torch.float64))
 
 

@@ -64,8 +64,8 @@ def test_a_bad_scan_is_one_line_with_its_path(case, scan, command, capsys, tmp_p
     [
         (["+experiment=calibrate"], "scans: the list is empty"),
         (["+experiment=calibrate", "scans=[nowhere]"], "nowhere"),
-        (["+experiment=calibrate", "scans=[x]", "calibration.method=jont"], "calibration.method: expected joint"),
-        (["+experiment=calibrate", "scans=[x]", "+spam=1"], "spam: unknown option"),
+        (["+experiment=calibrate", "scans=[x]", "calibration.method=jont"], "calibration.method: expected 'joint', "),
+        (["+experiment=calibrate", "scans=[x]", "+spam=1"], "spam: unknown key"),
         (["+experiment=correct", "scan=x"], "calibration"),
         (["+experiment=correct", "scan=nowhere", "calibration=none.json"], "nowhere"),
         (["+experiment=simulate", "scale=0.5"], "scale"),

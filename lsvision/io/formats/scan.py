@@ -1,26 +1,49 @@
 """The scan folder: ``scan.yaml`` with its rig, images and encoder log."""
 
 from collections.abc import Iterable, Mapping
-from json import dumps
+from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
-from typing import cast
+from typing import Annotated, Literal
 
 import torch
 import yaml
 from torch import Tensor
 
+from lsvision.errors import FileFormatError
 from lsvision.io.atomic import partial_folder, write_text
 from lsvision.io.formats.encoder import read_encoder, write_encoder
 from lsvision.io.formats.rig import read_rig, write_rig
-from lsvision.io.formats.validation import Fields, read_yaml
+from lsvision.io.formats.validation import named_file, read_entries, read_yaml
 from lsvision.io.images.line_image import open_line_image
 from lsvision.io.images.tiff import write_line_image
+from lsvision.io.json_file import write_json
+from lsvision.schema import Checked, Positive, Says, Text
 from lsvision.types import LineImage, Rig, Scan, Transport, Travel
 
-SCAN_FORMAT = "lsvision-scan/1"
+ScanFormat = Literal["lsvision-scan/1"]
+SCAN_FORMAT: ScanFormat = "lsvision-scan/1"
 SCAN_FILE = "scan.yaml"
+# Entries that name a file or folder of the scan.
+FILE_KEYS = ("rig", "left", "right", "depth", "encoder")
+IMAGE_KEYS = ("left", "right", "depth")
 _EMPTY: Mapping = MappingProxyType({})
+
+
+@dataclass(frozen=True)
+class ScanEntries(Checked):
+    """The entries of ``scan.yaml``."""
+
+    format: ScanFormat
+    rig: Text
+    line_pitch_mm: Positive
+    left: Text
+    right: Text | None = None
+    depth: Text | None = None
+    encoder: Text | None = None
+    transport: Transport | None = None
+    attributes: dict[str, Annotated[str | int | float, Says("text or a finite number")]] | None = None
+    color_registered: bool | None = None
 
 
 def read_scan(path: Path | str, *, repair_encoder: bool = False) -> Scan:
@@ -35,21 +58,46 @@ def read_scan(path: Path | str, *, repair_encoder: bool = False) -> Scan:
     """
     path = Path(path)
     file = path if path.is_file() else path / SCAN_FILE
-    fields = Fields(file, read_yaml(file))
-    fields.choice("format", SCAN_FORMAT)
-    rig = read_rig(fields.file("rig"))
-    images = {key: open_line_image(fields.file(key)) for key in ("left", "right", "depth") if fields.has(key)}
-    line_pitch_mm = fields.number("line_pitch_mm", above=0)
-    encoder = fields.file("encoder") if fields.has("encoder") else None
-    transport = fields.choice("transport", "forward", "reverse") if fields.has("transport") else "forward"
-    attributes = fields.texts("attributes") if fields.has("attributes") else {}
-    color_registered = fields.flag("color_registered") if fields.has("color_registered") else True
-    fields.finish()
-    _check_images(fields, rig, images)
+    entries = read_entries(ScanEntries, read_yaml(file), file)
+    files: dict[str, Path] = {
+        key: named_file(file, key, str(name)) for key in FILE_KEYS if (name := getattr(entries, key)) is not None
+    }
+    rig = read_rig(files["rig"])
+    images = {key: open_line_image(named) for key, named in files.items() if key in IMAGE_KEYS}
+    check_images(file, rig, images)
     left = images["left"]
-    positions_mm = read_encoder(encoder, left.shape[0], repair=repair_encoder) if encoder else None
-    travel = Travel(line_pitch_mm, positions_mm, cast(Transport, transport))
-    return Scan(file.parent, rig, travel, left, images.get("right"), images.get("depth"), color_registered, attributes)
+    encoder = files.get("encoder")
+    return Scan(
+        path=file.parent,
+        rig=rig,
+        travel=Travel(
+            line_pitch_mm=entries.line_pitch_mm,
+            positions_mm=read_encoder(encoder, left.shape[0], repair=repair_encoder) if encoder else None,
+            transport=entries.transport or "forward",
+        ),
+        left=left,
+        right=images.get("right"),
+        depth=images.get("depth"),
+        color_registered=entries.color_registered is not False,
+        attributes={name: str(value) for name, value in (entries.attributes or {}).items()},
+    )
+
+
+def scan_files(folder: Path | str) -> list[Path]:
+    """The files that make a scan, in a fixed order: ``scan.yaml``, and every file or folder that it names.
+
+    A name whose file is missing is listed as well.
+
+    Raises:
+        FileFormatError: ``scan.yaml`` cannot be read.
+    """
+    folder = Path(folder)
+    data = read_yaml(folder / SCAN_FILE)
+    entries = data if isinstance(data, Mapping) else {}
+    files = [folder / SCAN_FILE]
+    for named in (folder / str(entries[key]) for key in FILE_KEYS if entries.get(key) is not None):
+        files += sorted(file for file in named.rglob("*") if file.is_file()) if named.is_dir() else [named]
+    return files
 
 
 def write_scan(
@@ -95,7 +143,7 @@ def write_scan(
         if travel.positions_mm is not None:
             write_encoder(travel.positions_mm, partial / "encoder.csv")
         for name, content in extra_json.items():
-            write_text(partial / name, dumps(content, indent=2, allow_nan=False) + "\n")
+            write_json(partial / name, content, strict=True)
         write_text(partial / SCAN_FILE, yaml.safe_dump(data, sort_keys=False))
 
 
@@ -118,18 +166,21 @@ def _scan_data(travel: Travel, attributes: Mapping[str, str], color_registered: 
     return data
 
 
-def _check_images(fields: Fields, rig: Rig, images: Mapping[str, LineImage]) -> None:
-    if "left" not in images:
-        raise fields.error("left", "missing")
+def check_images(file: Path, rig: Rig, images: Mapping[str, LineImage]) -> None:
+    """Check that the images of a scan, by key, fit each other and the rig.
+
+    Raises:
+        FileFormatError: they do not; names ``file`` and the key.
+    """
     if ("right" in images) == ("depth" in images):
-        raise fields.error("right", f"expected exactly one of right and depth, got {len(images) - 1}")
+        raise FileFormatError(file, f"expected exactly one of right and depth, got {len(images) - 1}", "right")
     lines = images["left"].shape[0]
     for key, image in images.items():
         if image.shape[1] != rig.width_px:
-            raise fields.error(key, f"expected {rig.width_px} columns as the rig has, got {image.shape[1]}")
+            raise FileFormatError(file, f"expected {rig.width_px} columns as the rig has, got {image.shape[1]}", key)
         if image.shape[0] != lines:
-            raise fields.error(key, f"expected {lines} lines as left has, got {image.shape[0]}")
+            raise FileFormatError(file, f"expected {lines} lines as left has, got {image.shape[0]}", key)
         if key == "depth" and (image.dtype != torch.float32 or image.shape[2] != 1):
-            raise fields.error(key, f"expected one float32 channel, got {image.shape[2]} of {image.dtype}")
+            raise FileFormatError(file, f"expected one float32 channel, got {image.shape[2]} of {image.dtype}", key)
         if key != "depth" and image.dtype not in (torch.uint8, torch.uint16):
-            raise fields.error(key, f"expected uint8 or uint16, got {image.dtype}")
+            raise FileFormatError(file, f"expected uint8 or uint16, got {image.dtype}", key)

@@ -12,7 +12,7 @@ from torch import Tensor
 from lsvision.errors import CalibrationError, ConfigError
 from lsvision.estimation import Info, Posterior
 from lsvision.stages.calibration.config import CalibrationConfig
-from lsvision.stages.calibration.methods import METHODS, estimate
+from lsvision.stages.calibration.methods import estimate
 from lsvision.stages.calibration.model import (
     BoardProblem,
     MountingPitch,
@@ -68,7 +68,7 @@ def calibrate(boards: Sequence[BoardCorners], rig: Rig, config: CalibrationConfi
     Raises:
         CalibrationError: no boards; a board with fewer than six valid corners, corners on one line, or values or
             covariances that are not finite or not positive definite (names the scan); no solution.
-        ConfigError: an option out of range.
+        ConfigError: a mounting pitch is given for more than one board.
     """
     if not boards:
         raise CalibrationError("no board scans to calibrate from")
@@ -113,7 +113,7 @@ def calibrate_batch(
         One calibration a problem; a flawed problem is flagged in ``info`` and changes no bit of the others.
 
     Raises:
-        ConfigError: an option out of range.
+        ConfigError: a mounting pitch is given for more than one board.
     """
     return _solve(points, covariance, board_points, valid, config)[3]
 
@@ -122,10 +122,11 @@ def _solve(
     points: Tensor, covariance: Tensor, board_points: Tensor, valid: Tensor, config: CalibrationConfig
 ) -> tuple[BoardProblem, Posterior, Tensor, BatchCalibration]:
     """Problem, posterior, noise scale and summary of a batch."""
+    config = config.resolved()
     _check(config, points.shape[-3])
     problem, start, sound = _sound_problem(points, covariance, board_points, valid, _mounting_pitch(config))
     posterior = estimate(problem, start, config)
-    drifting = config.method == "sequential" and config.process_sigma > 0  # what one n leaves over is then no noise
+    drifting = config.method == "sequential" and bool(config.process_sigma)  # what one n leaves over is then no noise
     scale = torch.ones_like(start[..., 0]) if drifting else _noise_scale(problem, posterior)
     if bool((scale > 1).any()):
         noisier = replace(problem, noise_chol=problem.noise_chol * scale.sqrt()[..., None, None, None, None])
@@ -171,24 +172,9 @@ def _collinear(points: Tensor, seen: Tensor) -> Tensor:
 
 
 def _check(config: CalibrationConfig, boards: int) -> None:
-    """Raise ConfigError for the first option that is out of range."""
-    if config.method not in METHODS:
-        raise ConfigError(f"calibration.method must be one of {', '.join(METHODS)}, is {config.method}")
-    for name in ("prior_sigma", "rotation_sigma_rad", "translation_sigma_mm", "mounting_pitch_sigma_deg"):
-        if not getattr(config, name) > 0:
-            raise ConfigError(f"calibration.{name} must be positive, is {getattr(config, name)}")
-    for name in ("max_iterations", "two_step_max_iterations"):
-        if getattr(config, name) < 1:
-            raise ConfigError(f"calibration.{name} must be at least 1, is {getattr(config, name)}")
-    for name in ("tolerance", "two_step_threshold_mm", "process_sigma"):
-        if not getattr(config, name) >= 0:
-            raise ConfigError(f"calibration.{name} must not be negative, is {getattr(config, name)}")
-    if not math.isfinite(config.prior_sigma):
-        raise ConfigError("calibration.prior_sigma must be finite: not every board scan determines n without a prior")
+    """Raise ConfigError where an option does not fit the number of boards."""
     if config.mounting_pitch_deg is not None and boards != 1:
-        raise ConfigError(f"calibration.mounting_pitch_deg is for a single board scan, not for {boards}")
-    if config.mounting_pitch_deg is not None and config.method in ("two_step", "sequential"):
-        raise ConfigError(f"calibration.mounting_pitch_deg has no place in the method {config.method}")
+        raise ConfigError(f"calibration.mounting_pitch_deg: expected null, as there are {boards} board scans, not one")
 
 
 def _mounting_pitch(config: CalibrationConfig) -> MountingPitch | None:

@@ -86,7 +86,7 @@ def sequential(problem: BoardProblem, start: Float[Tensor, "*batch state"], conf
     The result is n at the end of the last scan. Each pass filters from the same prior with the corners linearised about
     the pass before: the boards' poses do not move, so that their last state is their smoothed one.
     """
-    rows_order, valid, process = _line_order(problem, config.process_sigma)
+    rows_order, valid, process = _line_order(problem, config.process_sigma or 0.0)
     mean, factor, path = start, _point(start), [start]
     running = torch.ones_like(start[..., 0], dtype=torch.bool)
     iterations = torch.zeros_like(running, dtype=torch.long)

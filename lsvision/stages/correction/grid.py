@@ -5,7 +5,7 @@ import math
 import torch
 from torch import Tensor
 
-from lsvision.errors import ConfigError, FileFormatError
+from lsvision.errors import FileFormatError
 from lsvision.geometry import product_axes, travel_at
 from lsvision.stages.correction.config import CorrectionConfig
 from lsvision.types import Motion, ProductGrid, Rig, Scan
@@ -15,12 +15,9 @@ def plan_product(scan: Scan, motion: Motion, config: CorrectionConfig) -> Produc
     """Grid that holds everything of a scan: the whole field at every depth of the range, from first to last line.
 
     Raises:
-        ConfigError: the pitch is not positive.
         FileFormatError: the scan has but one line.
     """
     pitch = config.pitch_mm if config.pitch_mm is not None else abs(scan.travel.line_pitch_mm)
-    if not (pitch > 0 and math.isfinite(pitch)):
-        raise ConfigError(f"correction.pitch_mm must be positive, got {pitch}")
     if scan.lines < 2:
         raise FileFormatError(scan.path, f"expected at least two lines, which a surface needs, got {scan.lines}")
     x, z = _field(scan.rig, config)

@@ -61,10 +61,11 @@ def measure_block(
     left: LineImage, right: LineImage, rig: Rig, config: DisparityConfig, white: float, index: int
 ) -> StripMatch:
     """Disparity of the block of some index, of images of any length."""
-    start, lines = index * config.block_lines, left.shape[0]
+    config = config.for_width(left.shape[1])
+    start, lines, halo = index * config.block_lines, left.shape[0], config.halo_lines or 0
     stop = min(start + config.block_lines, lines)
-    above, below = max(start - config.halo_lines, 0), min(stop + config.halo_lines, lines)
-    match = _measure(left.read(above, below), right.read(above, below), rig, config.for_width(left.shape[1]), white)
+    above, below = max(start - halo, 0), min(stop + halo, lines)
+    match = _measure(left.read(above, below), right.read(above, below), rig, config, white)
     inner = slice(start - above, stop - above)
     return StripMatch(match.disparity[inner], match.sigma[inner])
 

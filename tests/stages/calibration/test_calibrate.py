@@ -267,13 +267,18 @@ def test_no_boards():
         ({"prior_sigma": 0.0}, "prior_sigma"),
         ({"prior_sigma": math.inf}, "prior_sigma"),
         ({"rotation_sigma_rad": -1.0}, "rotation_sigma_rad"),
-        ({"mounting_pitch_deg": 3.0}, "mounting_pitch_deg"),
         ({"mounting_pitch_deg": 3.0, "mounting_pitch_sigma_deg": 0.0}, "mounting_pitch_sigma_deg"),
         ({"method": "joynt"}, "method"),
+        ({"method": "two_step", "mounting_pitch_deg": 3.0}, "mounting_pitch_deg"),
         ({"max_iterations": 0}, "max_iterations"),
         ({"process_sigma": -1.0}, "process_sigma"),
     ],
 )
 def test_options_out_of_range_are_named(options, name):
-    with pytest.raises(ConfigError, match=rf"calibration\.{name}"):
-        calibrate(simulate(THREE_TILTS[:2]).boards(), RIG, CalibrationConfig(**options))
+    with pytest.raises(ConfigError, match=rf"CalibrationConfig\.{name}: expected"):
+        CalibrationConfig(**options)
+
+
+def test_a_mounting_pitch_is_for_one_board():
+    with pytest.raises(ConfigError, match=r"calibration\.mounting_pitch_deg: expected null"):
+        calibrate(simulate(THREE_TILTS[:2]).boards(), RIG, CalibrationConfig(mounting_pitch_deg=3.0))
