@@ -34,7 +34,7 @@ def config_folder() -> Path:
 def _run(config: DictConfig) -> None:
     if config.name not in EXPERIMENTS:
         raise ConfigError(f"no experiment chosen: add +experiment=NAME with NAME one of {', '.join(EXPERIMENTS)}")
-    import torch  # only now: the help shall not wait for it
+    import torch  # here, so that --help does not wait for it
 
     from lsvision.experiments.settings import build_settings
 

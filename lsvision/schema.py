@@ -26,15 +26,8 @@ class Says:
     words: str
 
 
-def is_odd(value: int) -> bool:
-    """Whether a whole number is odd."""
-    return value % 2 == 1
-
-
-def rises(interval: tuple[float, float]) -> bool:
-    """Whether the low end of an interval lies below the high one."""
-    return interval[0] < interval[1]
-
+IS_ODD = Predicate(lambda value: value % 2 == 1)
+RISES = Predicate(lambda interval: interval[0] < interval[1])
 
 Positive = Annotated[float, Gt(0)]
 NonNegative = Annotated[float, Ge(0)]
@@ -44,11 +37,11 @@ AcuteAngle = Annotated[float, Gt(-90), Lt(90)]  # degrees
 PositiveInt = Annotated[int, Ge(1)]
 NonNegativeInt = Annotated[int, Ge(0)]
 IntFrom2 = Annotated[int, Ge(2)]
-OddInt = Annotated[int, Ge(1), Predicate(is_odd), Says("an odd whole number >= 1")]
-OddIntFrom3 = Annotated[int, Ge(3), Predicate(is_odd), Says("an odd whole number >= 3")]
+OddInt = Annotated[int, Ge(1), IS_ODD, Says("an odd whole number >= 1")]
+OddIntFrom3 = Annotated[int, Ge(3), IS_ODD, Says("an odd whole number >= 3")]
 Percent = Annotated[int, Ge(0), Le(100)]
 Seed = Annotated[int, Ge(0), Lt(2**32)]
-Interval = Annotated[tuple[float, float], Predicate(rises), Says("a list of two finite numbers, the lower one first")]
+Interval = Annotated[tuple[float, float], RISES, Says("a list of two finite numbers, the lower one first")]
 Wavelengths = Annotated[tuple[Positive, ...], MinLen(1)]
 Text = Annotated[str, MinLen(1)]
 
@@ -66,13 +59,7 @@ _KINDS: dict[object, str] = {
 
 
 class OptionError(ConfigError):
-    """A field of a checked dataclass that does not hold what it may.
-
-    Args:
-        owner: name of the dataclass.
-        key: the field, dotted where it lies deeper.
-        problem: what was expected and what came, in words.
-    """
+    """A value that a field of a checked dataclass does not allow; names the dataclass ``owner`` and the field ``key``."""
 
     def __init__(self, owner: str, key: str, problem: str) -> None:
         super().__init__(f"{owner}.{key}: {problem}")
@@ -93,7 +80,7 @@ class Checked:
     A rule between fields extends ``__post_init__`` and raises ``fault``.
 
     Raises:
-        OptionError: a field does not hold what its annotation allows.
+        OptionError: a value that its annotation does not allow.
     """
 
     def __post_init__(self) -> None:
@@ -102,7 +89,7 @@ class Checked:
             object.__setattr__(self, name, check(annotation, getattr(self, name), name, self.fault))
 
     def fault(self, key: str, problem: str) -> OptionError:
-        """The error about one of the fields."""
+        """The error about the value of a field."""
         return OptionError(type(self).__name__, key, problem)
 
 
@@ -150,10 +137,10 @@ def annotations_of(schema: Any) -> dict[str, Any]:
 
 
 def check(annotation: Any, value: object, key: str, fault: Fault) -> Any:
-    """A value as its annotation asks for it: lists become tuples, mappings dataclasses, whole numbers floats.
+    """Check a value and convert it as its annotation asks: lists to tuples, mappings to dataclasses, 3 to 3.0.
 
     Args:
-        annotation: a scalar type, a dataclass, or lists, tuples and dictionaries of them, any of it ``Annotated``.
+        annotation: a scalar type, a dataclass, or lists, tuples and dictionaries of them, any of them ``Annotated``.
         key: where the value stands ("correction.strip_rows").
         fault: makes the error.
     """

@@ -4,10 +4,12 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from hydra.core.config_search_path import ConfigSearchPath
 from hydra.core.object_type import ObjectType
 from hydra.core.plugins import Plugins
 from hydra.experimental.callback import Callback
 from hydra.plugins.config_source import ConfigResult, ConfigSource
+from hydra.plugins.search_path_plugin import SearchPathPlugin
 from omegaconf import DictConfig, OmegaConf
 
 from lsvision.experiments import EXPERIMENTS
@@ -52,6 +54,14 @@ class SettingsSource(ConfigSource):
         return []
 
 
+class SettingsPath(SearchPathPlugin):
+    """Puts ``SettingsSource`` among the places that Hydra composes from."""
+
+    def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
+        """Append it."""
+        search_path.append(provider="lsvision", path=f"{SettingsSource.scheme()}://")
+
+
 class SweepReport(Callback):
     """Hydra's hook at the end of a sweep."""
 
@@ -69,7 +79,8 @@ class SweepReport(Callback):
 
 def register_settings() -> None:
     """Make the nodes known to Hydra; before anything is composed."""
-    Plugins.instance().register(SettingsSource)
+    for plugin in (SettingsSource, SettingsPath):
+        Plugins.instance().register(plugin)
 
 
 def _experiment_of(config_path: str) -> str:

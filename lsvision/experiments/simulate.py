@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from lsvision.experiments.settings import RunSettings
-from lsvision.io import write_scan
+from lsvision.io import NewScan, write_scan
 from lsvision.report.progress import ProgressBars, progress_bars
 from lsvision.schema import Positive, PositiveInt, Scale, Text
 from lsvision.simulation import (
@@ -84,14 +84,16 @@ def write_simulation(
 
     write_scan(
         target,
-        rig=simulation.rig,
-        travel=simulation.travel,
-        left=counted(simulation.strips("left", strip_lines)),
-        right=None if depth else counted(simulation.strips("right", strip_lines)),
-        depth=counted(strip[..., None] for strip in simulation.depth_strips(strip_lines)) if depth else None,
-        lines=simulation.lines,
-        channels=simulation.channels,
-        dtype=torch.uint16 if simulation.sensor.bits == 16 else torch.uint8,
-        color_registered=simulation.sensor.color_registered,
-        extra_json={"truth.json": simulation.truth()},
+        NewScan(
+            rig=simulation.rig,
+            travel=simulation.travel,
+            left=counted(simulation.strips("left", strip_lines)),
+            right=None if depth else counted(simulation.strips("right", strip_lines)),
+            depth=counted(strip[..., None] for strip in simulation.depth_strips(strip_lines)) if depth else None,
+            lines=simulation.lines,
+            channels=simulation.channels,
+            dtype=torch.uint16 if simulation.sensor.bits == 16 else torch.uint8,
+            color_registered=simulation.sensor.color_registered,
+            extra_json={"truth.json": simulation.truth()},
+        ),
     )

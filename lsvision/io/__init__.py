@@ -5,7 +5,7 @@ from lsvision.io.formats.calibration import check_rig_match, read_calibration, w
 from lsvision.io.formats.checksum import scan_sha256
 from lsvision.io.formats.encoder import read_encoder, write_encoder
 from lsvision.io.formats.rig import read_rig, rig_from_dict, rig_to_dict, write_rig
-from lsvision.io.formats.scan import read_scan, scan_files, write_scan
+from lsvision.io.formats.scan import NewScan, read_scan, scan_files, write_scan
 from lsvision.io.images.line_image import open_line_image
 from lsvision.io.images.tiff import write_line_image
 from lsvision.io.json_file import finite_or_null, write_json
@@ -18,6 +18,7 @@ from lsvision.io.product.writer import ProductLayout, ProductRows, ProductWriter
 
 __all__ = [
     "ExportFormat",
+    "NewScan",
     "Product",
     "ProductCheck",
     "ProductLayout",

@@ -1,9 +1,8 @@
 """The scan folder: ``scan.yaml`` with its rig, images and encoder log."""
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from types import MappingProxyType
 from typing import Annotated, Literal
 
 import torch
@@ -27,7 +26,6 @@ SCAN_FILE = "scan.yaml"
 # Entries that name a file or folder of the scan.
 FILE_KEYS = ("rig", "left", "right", "depth", "encoder")
 IMAGE_KEYS = ("left", "right", "depth")
-_EMPTY: Mapping = MappingProxyType({})
 
 
 @dataclass(frozen=True)
@@ -42,8 +40,55 @@ class ScanEntries(Checked):
     depth: Text | None = None
     encoder: Text | None = None
     transport: Transport | None = None
-    attributes: dict[str, Annotated[str | int | float, Says("text or a finite number")]] | None = None
     color_registered: bool | None = None
+    attributes: dict[str, Annotated[str | int | float, Says("text or a finite number")]] | None = None
+
+
+@dataclass(frozen=True)
+class NewScan:
+    """A scan to be written.
+
+    ``left``, ``right`` and ``depth`` are strips ``(lines, width, channels)`` of any height, each image taken to its end
+    before the next; exactly one of right and depth is given. Depth is float32 z, mm, one channel, NaN where there is
+    none. ``extra_json`` is plain data by file name, written beside the scan ("truth.json").
+
+    Raises:
+        ValueError: not exactly one of right and depth, or an encoder log of another length.
+    """
+
+    rig: Rig
+    travel: Travel
+    left: Iterable[Tensor]
+    right: Iterable[Tensor] | None
+    lines: int
+    depth: Iterable[Tensor] | None = None
+    channels: int = 3
+    dtype: torch.dtype = torch.uint8
+    attributes: Mapping[str, str] = field(default_factory=dict)
+    color_registered: bool = True
+    extra_json: Mapping[str, dict] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if (self.right is None) == (self.depth is None):
+            raise ValueError("right, depth: expected exactly one of them")
+        positions_mm = self.travel.positions_mm
+        if positions_mm is not None and len(positions_mm) != self.lines:
+            raise ValueError(f"travel.positions_mm: expected {self.lines} positions, got {len(positions_mm)}")
+
+    def entries(self) -> ScanEntries:
+        """What ``scan.yaml`` says; an entry at its default is None."""
+        return ScanEntries(
+            format=SCAN_FORMAT,
+            rig="rig.yaml",
+            line_pitch_mm=self.travel.line_pitch_mm,
+            left="left.tif",
+            right=None if self.right is None else "right.tif",
+            depth=None if self.depth is None else "depth.tif",
+            encoder=None if self.travel.positions_mm is None else "encoder.csv",
+            transport=None if self.travel.transport == "forward" else self.travel.transport,
+            color_registered=None if self.color_registered else False,
+            attributes={name: str(value) for name, value in self.attributes.items()} or None,
+        )
 
 
 def read_scan(path: Path | str, *, repair_encoder: bool = False) -> Scan:
@@ -100,70 +145,30 @@ def scan_files(folder: Path | str) -> list[Path]:
     return files
 
 
-def write_scan(
-    folder: Path | str,
-    *,
-    rig: Rig,
-    travel: Travel,
-    left: Iterable[Tensor],
-    right: Iterable[Tensor] | None,
-    depth: Iterable[Tensor] | None = None,
-    lines: int,
-    channels: int = 3,
-    dtype: torch.dtype = torch.uint8,
-    attributes: Mapping[str, str] = _EMPTY,
-    color_registered: bool = True,
-    extra_json: Mapping[str, dict] = _EMPTY,
-) -> None:
+def write_scan(folder: Path | str, scan: NewScan) -> None:
     """Write a scan folder from strips; it appears under its name when complete.
 
     Args:
         folder: a new or empty folder, or an earlier scan to replace.
-        left, right, depth: strips ``(lines, width, channels)`` of any height, each image taken to its end before the
-            next; exactly one of right and depth. Depth is float32 z, mm, one channel, NaN where there is none.
-        extra_json: plain data by file name, written beside the scan ("truth.json").
 
     Raises:
-        ValueError: strips that do not add up to the image, or not exactly one of right and depth.
+        ValueError: strips that do not add up to the image.
         FileFormatError: ``folder`` holds something else.
     """
-    if (right is None) == (depth is None):
-        raise ValueError("right, depth: expected exactly one of them")
-    if travel.positions_mm is not None and len(travel.positions_mm) != lines:
-        raise ValueError(f"travel.positions_mm: expected {lines} positions, got {len(travel.positions_mm)}")
-    data = _scan_data(travel, attributes, color_registered, "depth" if right is None else "right")
-    shape = (lines, rig.width_px, channels)
+    shape = (scan.lines, scan.rig.width_px, scan.channels)
     with partial_folder(folder, marker=SCAN_FILE) as partial:
-        write_rig(rig, partial / "rig.yaml")
-        write_line_image(partial / "left.tif", left, shape, dtype)
-        if right is not None:
-            write_line_image(partial / "right.tif", right, shape, dtype)
-        if depth is not None:
-            write_line_image(partial / "depth.tif", depth, (lines, rig.width_px, 1), torch.float32)
-        if travel.positions_mm is not None:
-            write_encoder(travel.positions_mm, partial / "encoder.csv")
-        for name, content in extra_json.items():
+        write_rig(scan.rig, partial / "rig.yaml")
+        write_line_image(partial / "left.tif", scan.left, shape, scan.dtype)
+        if scan.right is not None:
+            write_line_image(partial / "right.tif", scan.right, shape, scan.dtype)
+        if scan.depth is not None:
+            write_line_image(partial / "depth.tif", scan.depth, (scan.lines, scan.rig.width_px, 1), torch.float32)
+        if scan.travel.positions_mm is not None:
+            write_encoder(scan.travel.positions_mm, partial / "encoder.csv")
+        for name, content in scan.extra_json.items():
             write_json(partial / name, content, strict=True)
-        write_text(partial / SCAN_FILE, yaml.safe_dump(data, sort_keys=False))
-
-
-def _scan_data(travel: Travel, attributes: Mapping[str, str], color_registered: bool, second: str) -> dict[str, object]:
-    data: dict[str, object] = {
-        "format": SCAN_FORMAT,
-        "rig": "rig.yaml",
-        "line_pitch_mm": float(travel.line_pitch_mm),
-        "left": "left.tif",
-        second: f"{second}.tif",
-    }
-    if travel.positions_mm is not None:
-        data["encoder"] = "encoder.csv"
-    if travel.transport != "forward":
-        data["transport"] = travel.transport
-    if not color_registered:
-        data["color_registered"] = False
-    if attributes:
-        data["attributes"] = {name: str(value) for name, value in attributes.items()}
-    return data
+        entries = {key: value for key, value in asdict(scan.entries()).items() if value is not None}
+        write_text(partial / SCAN_FILE, yaml.safe_dump(entries, sort_keys=False))
 
 
 def check_images(file: Path, rig: Rig, images: Mapping[str, LineImage]) -> None:
