@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any, cast
 
 import hydra
-import torch
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
@@ -18,10 +17,11 @@ from omegaconf.errors import OmegaConfBaseException
 
 from lsvision.errors import ConfigError, LsvisionError
 from lsvision.experiments import EXPERIMENTS
-from lsvision.experiments.settings import build_settings
-from lsvision.experiments.sweep import run_job
+from lsvision.experiments.hydra_hooks import register_settings
 
 log = logging.getLogger("lsvision")
+
+register_settings()
 
 
 def config_folder() -> Path:
@@ -34,26 +34,32 @@ def config_folder() -> Path:
 def _run(config: DictConfig) -> None:
     if config.name not in EXPERIMENTS:
         raise ConfigError(f"no experiment chosen: add +experiment=NAME with NAME one of {', '.join(EXPERIMENTS)}")
-    experiment, schema = EXPERIMENTS[config.name]
+    import torch  # here, so that --help does not wait for it
+
+    from lsvision.experiments.settings import build_settings
+
+    experiment = EXPERIMENTS[config.name]
     try:
         values = cast(dict[str, Any], OmegaConf.to_container(config, resolve=True, throw_on_missing=True))
     except OmegaConfBaseException as error:
         raise ConfigError(str(error).splitlines()[0]) from error
-    settings = build_settings(schema, values)
+    settings = build_settings(experiment.schema, values)
     logging.getLogger("tifffile").setLevel(logging.CRITICAL)  # damaged files are reported once, by our own error
     torch.manual_seed(settings.seed)
     torch.set_num_threads(settings.threads)
-    experiment(settings, Path(HydraConfig.get().runtime.output_dir))
+    experiment.run(settings, Path(HydraConfig.get().runtime.output_dir))
 
 
 @hydra.main(version_base="1.3", config_path=str(config_folder()), config_name="config")
 def main(config: DictConfig) -> None:
     """Run the experiment that the configuration names; an expected failure is one line and its exit code.
 
-    A job of a sweep writes its failure down instead, and the others go on.
+    A job of a sweep records its failure instead, and the others go on.
     """
     hydra_config = HydraConfig.get()
     if hydra_config.mode == RunMode.MULTIRUN:
+        from lsvision.experiments.sweep import run_job
+
         folder = Path(hydra_config.runtime.output_dir)
         failure = run_job(partial(_run, config), folder, list(hydra_config.overrides.task))
         if failure is not None:

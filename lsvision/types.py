@@ -14,25 +14,33 @@ import torch
 from jaxtyping import Bool, Float, Shaped
 from torch import Tensor
 
+from lsvision.schema import Checked, IntFrom2, NonNegative, Positive, PositiveInt
+
 Transport = Literal["forward", "reverse"]
 CalibrationMethod = Literal["joint", "two_step", "sequential", "least_squares"]
 
 
 @dataclass(frozen=True)
-class Rig:
+class Rig(Checked):
     """A rectified pair of line cameras: both sensors on one line, optical axes parallel (Eq. 2).
 
     ``color_spacing_lines`` is where the red, green and blue sensor lines look along Y, in nominal lines, for a
     trilinear sensor; (0, 0, 0) where all three see the same line of the object.
     """
 
-    width_px: int
-    pixel_pitch_um: float
-    focal_length_mm: float
-    baseline_mm: float
+    width_px: PositiveInt
+    pixel_pitch_um: Positive
+    focal_length_mm: Positive
+    baseline_mm: Positive
     principal_left_px: float
     principal_right_px: float
     color_spacing_lines: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        left, right = self.principal_left_px, self.principal_right_px
+        if right <= left:  # no plane in front of the cameras has zero disparity
+            raise self.fault("principal_right_px", f"expected a finite number > {left:g}, got {right}")
 
     @property
     def focal_length_px(self) -> float:
@@ -51,12 +59,12 @@ class Rig:
 
 
 @dataclass(frozen=True)
-class Board:
+class Board(Checked):
     """A checkerboard of ``columns x rows`` squares; the longer side, X, comes first."""
 
-    columns: int
-    rows: int
-    square_mm: float
+    columns: IntFrom2
+    rows: IntFrom2
+    square_mm: Positive
 
     @property
     def inner(self) -> tuple[int, int]:
@@ -80,7 +88,7 @@ class Travel:
     transport makes later lines see smaller Y.
     """
 
-    line_pitch_mm: float
+    line_pitch_mm: Positive
     positions_mm: Float[Tensor, " lines"] | None = None
     transport: Transport = "forward"
 
@@ -177,6 +185,7 @@ class Depth:
     sigma: Float[Tensor, "lines width"] | None = None
 
 
+@runtime_checkable
 class DepthSource(Protocol):
     """The depth of a scan's left image, read by line ranges."""
 
@@ -255,9 +264,9 @@ class Motion:
 class Iteration:
     """State of a calibration after one iteration."""
 
-    rmse_mm: float
+    rmse_mm: NonNegative
     n: tuple[float, float, float]
-    stretch: float
+    stretch: Positive
 
 
 @dataclass(frozen=True)
@@ -277,8 +286,8 @@ class ObservedDirection:
     """A direction of n and how much the data narrowed the prior along it."""
 
     vector: tuple[float, float, float]
-    prior_sigma: float
-    posterior_sigma: float
+    prior_sigma: Positive
+    posterior_sigma: NonNegative
     observed: bool
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from lsvision.errors import FileFormatError
-from lsvision.io.formats.checksum import FILE_KEYS
+from lsvision.io.formats.scan import FILE_KEYS
 from lsvision.io.formats.validation import read_yaml
 from lsvision.stages.correction.config import CorrectionConfig
 from lsvision.stages.disparity.config import DisparityConfig

@@ -163,7 +163,8 @@ def _strip_rows(scan: Scan, grid: ProductGrid, processing: Processing, path: Pat
     memory_bytes = processing.worker_memory_mb * 2**20
     if isinstance(scan.images, StereoPair):
         low, high = disparity_range(scan.rig, processing.disparity)
-        lines = processing.disparity.block_lines + 2 * processing.disparity.halo_lines
+        disparity = processing.disparity.for_width(scan.rig.width_px)
+        lines = disparity.block_lines + 2 * (disparity.halo_lines or 0)
         # Besides images and their gradients the matcher keeps costs of a few lines over the whole range.
         needed = IDLE_BYTES + scan.rig.width_px * (lines * _MATCHING_BYTES_PER_PX + 64 * (high - low))
         if needed > memory_bytes:

@@ -1,28 +1,48 @@
-"""The experiments a run can choose: each reads, calls stages, and writes."""
+"""The experiments a run can choose: each reads, calls stages, and writes. One is imported when it is chosen."""
 
 from collections.abc import Callable
+from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from lsvision.experiments.calibrate import CalibrateSettings, run_calibrate
-from lsvision.experiments.correct import CorrectSettings, run_correct
-from lsvision.experiments.paper import PaperSettings, run_paper
-from lsvision.experiments.reprocess import ReprocessSettings, StatusSettings, run_reprocess, run_status
-from lsvision.experiments.settings import RunSettings
-from lsvision.experiments.simulate import SimulateSettings, run_simulate
-from lsvision.experiments.study import StudySettings, run_study
-from lsvision.experiments.sweep import CollectSettings, run_collect
-from lsvision.experiments.validate import ValidateSettings, run_validate
+if TYPE_CHECKING:
+    from lsvision.experiments.settings import RunSettings
 
-# By name: the function and the schema of its options.
-EXPERIMENTS: dict[str, tuple[Callable[[Any, Path], None], type[RunSettings]]] = {
-    "paper": (run_paper, PaperSettings),
-    "simulate": (run_simulate, SimulateSettings),
-    "calibrate": (run_calibrate, CalibrateSettings),
-    "correct": (run_correct, CorrectSettings),
-    "reprocess": (run_reprocess, ReprocessSettings),
-    "status": (run_status, StatusSettings),
-    "validate": (run_validate, ValidateSettings),
-    "study": (run_study, StudySettings),
-    "collect": (run_collect, CollectSettings),
+
+@dataclass(frozen=True)
+class Experiment:
+    """Where an experiment stands: its module here, its function and the dataclass of its options."""
+
+    module: str
+    function: str
+    settings: str
+
+    @property
+    def run(self) -> Callable[[Any, Path], None]:
+        """The function; takes the settings and the run's folder."""
+        run: Callable[[Any, Path], None] = getattr(self._imported, self.function)
+        return run
+
+    @property
+    def schema(self) -> type["RunSettings"]:
+        """The dataclass of the options, with their defaults and ranges."""
+        schema: type[RunSettings] = getattr(self._imported, self.settings)
+        return schema
+
+    @property
+    def _imported(self) -> object:
+        return import_module(f"{__name__}.{self.module}")
+
+
+EXPERIMENTS = {
+    "paper": Experiment("paper", "run_paper", "PaperSettings"),
+    "simulate": Experiment("simulate", "run_simulate", "SimulateSettings"),
+    "calibrate": Experiment("calibrate", "run_calibrate", "CalibrateSettings"),
+    "correct": Experiment("correct", "run_correct", "CorrectSettings"),
+    "reprocess": Experiment("reprocess", "run_reprocess", "ReprocessSettings"),
+    "status": Experiment("reprocess", "run_status", "StatusSettings"),
+    "validate": Experiment("validate", "run_validate", "ValidateSettings"),
+    "study": Experiment("study", "run_study", "StudySettings"),
+    "collect": Experiment("sweep", "run_collect", "CollectSettings"),
 }

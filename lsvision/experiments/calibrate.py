@@ -1,17 +1,17 @@
 """``+experiment=calibrate``: scans of boards -> corners -> ``calibration.json`` and a report."""
 
-import json
 import logging
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 from lsvision import __version__
 from lsvision.errors import CalibrationError, ConfigError
 from lsvision.experiments.settings import RunSettings, settings_sha256
-from lsvision.io import read_scan, scan_sha256, write_calibration, write_text
+from lsvision.io import read_scan, scan_sha256, write_calibration, write_json
 from lsvision.report import calibration_report, calibration_summary
 from lsvision.report.progress import progress_bars
+from lsvision.schema import Text
 from lsvision.stages.calibration.calibrate import calibrate
 from lsvision.stages.calibration.config import CalibrationConfig
 from lsvision.stages.corners.config import CornersConfig
@@ -25,11 +25,11 @@ log = logging.getLogger(__name__)
 class CalibrateSettings(RunSettings):
     """Options of the experiment; ``output`` is the file to write, ``calibration.json`` in the run's folder if None."""
 
-    scans: list[str]
+    scans: list[Text] = field(default_factory=list)
     board: Board
     corners: CornersConfig
     calibration: CalibrationConfig
-    output: str | None = None
+    output: Text | None = None
 
 
 def run_calibrate(settings: CalibrateSettings, folder: Path) -> None:
@@ -45,7 +45,7 @@ def run_calibrate(settings: CalibrateSettings, folder: Path) -> None:
     calibration = replace(calibration, provenance=provenance)
     target = Path(settings.output) if settings.output else folder / "calibration.json"
     write_calibration(calibration, target)
-    write_text(folder / "summary.json", json.dumps(_summary(calibration), indent=2) + "\n")
+    write_json(folder / "summary.json", _summary(calibration))
     calibration_report(calibration, boards, asdict(settings), folder)
     log.info("%s\nwrote %s and %s", calibration_summary(calibration), target, folder / "report.html")
 

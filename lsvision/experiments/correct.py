@@ -1,6 +1,5 @@
 """``+experiment=correct``: one scan and its calibration -> a product, with pictures."""
 
-import json
 import logging
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -18,10 +17,11 @@ from lsvision.io import (
     read_calibration,
     read_product,
     read_scan,
-    write_text,
+    write_json,
 )
 from lsvision.report import product_report
 from lsvision.report.progress import ProgressBars, progress_bars
+from lsvision.schema import Text
 from lsvision.stages.correction.config import CorrectionConfig
 from lsvision.stages.correction.correct import correct_scan
 from lsvision.stages.correction.grid import plan_product
@@ -40,13 +40,13 @@ class CorrectSettings(RunSettings):
     The formats of ``export`` are written beside it.
     """
 
-    scan: str
-    calibration: str
+    scan: Text
+    calibration: Text
     disparity: DisparityConfig
     correction: CorrectionConfig
     repair_encoder: bool = False
     export: list[ExportFormat] = field(default_factory=list)
-    output: str | None = None
+    output: Text | None = None
 
 
 @dataclass(frozen=True)
@@ -78,7 +78,7 @@ def run_correct(settings: CorrectSettings, folder: Path) -> None:
         summary = write_product(
             scan, calibration.motion, settings.disparity, settings.correction, target, bars, metadata
         )
-    write_text(folder / "summary.json", json.dumps(asdict(summary), indent=2) + "\n")
+    write_json(folder / "summary.json", asdict(summary))
     product = read_product(target)
     for name in settings.export:
         for file in export_product(product, name, target.with_suffix("")):

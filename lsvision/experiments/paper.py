@@ -4,20 +4,23 @@ Renders boards, a sheet and a rail, writes them as scan folders, reads them back
 all scans and compares the figures with the paper's: once without vibration and once with it.
 """
 
-import json
 import logging
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Annotated
+
+from annotated_types import MinLen
 
 from lsvision.experiments.correct import write_product
 from lsvision.experiments.parallel import map_names, scan_pool
 from lsvision.experiments.settings import RunSettings
 from lsvision.experiments.simulate import write_simulation
 from lsvision.geometry import displace, scaled_rig
-from lsvision.io import Product, read_product, read_scan, write_calibration, write_text
+from lsvision.io import Product, read_product, read_scan, write_calibration, write_json
 from lsvision.report.paper_pages import write_paper_report
 from lsvision.report.paper_scenario import PAPER, BoardCheck, Scenario
 from lsvision.report.progress import ProgressBars, progress_bars
+from lsvision.schema import Positive, Scale
 from lsvision.simulation import (
     Acquisition,
     BoardPose,
@@ -53,14 +56,14 @@ class PaperSettings(RunSettings):
     still: MotionConfig
     vibrating: MotionConfig
     sensor: SensorConfig
-    poses: list[BoardPose]
+    poses: Annotated[list[BoardPose], MinLen(1)]
     corners: CornersConfig
     joint: CalibrationConfig
     two_step: CalibrationConfig
     disparity: DisparityConfig
     correction: CorrectionConfig
-    scale: float = 4.0
-    line_pitch_mm: float = 0.07
+    scale: Scale = 4.0
+    line_pitch_mm: Positive = 0.07
 
 
 def run_paper(settings: PaperSettings, folder: Path) -> None:
@@ -71,7 +74,7 @@ def run_paper(settings: PaperSettings, folder: Path) -> None:
             log.info("scenario %s: render, calibrate, correct", name)
             scenarios[name] = _scenario(settings, motion, folder / name, bars)
     summary = {"paper": PAPER, **{name: scenario.summary() for name, scenario in scenarios.items()}}
-    write_text(folder / "summary.json", json.dumps(summary, indent=2) + "\n")
+    write_json(folder / "summary.json", summary)
     write_paper_report(folder, scenarios, asdict(settings))
     for name, scenario in scenarios.items():
         for method, result in scenario.results.items():

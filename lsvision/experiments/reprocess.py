@@ -35,6 +35,7 @@ from lsvision.errors import ConfigError, ScansFailedError
 from lsvision.experiments.settings import RunSettings
 from lsvision.report.archive_pages import reprocess_report
 from lsvision.report.progress import progress_bars
+from lsvision.schema import PositiveInt, Text
 from lsvision.stages.correction.config import CorrectionConfig
 from lsvision.stages.disparity.config import DisparityConfig
 
@@ -45,9 +46,9 @@ log = logging.getLogger(__name__)
 class ReprocessSettings(RunSettings):
     """Options of the experiment; products lie below ``output`` as their scans do below ``archive``."""
 
-    archive: str
-    calibration: str
-    output: str
+    archive: Text
+    calibration: Text
+    output: Text
     engine: EngineConfig
     disparity: DisparityConfig
     correction: CorrectionConfig
@@ -60,7 +61,8 @@ class ReprocessSettings(RunSettings):
 class StatusSettings(RunSettings):
     """Options of ``+experiment=status``."""
 
-    output: str
+    output: Text
+    threads: PositiveInt = 1
 
 
 def run_reprocess(settings: ReprocessSettings, folder: Path) -> None:

@@ -8,11 +8,11 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from lsvision.errors import ConfigError
 from lsvision.experiments.settings import RunSettings
 from lsvision.geometry import scaled_rig
-from lsvision.io import write_scan
+from lsvision.io import NewScan, write_scan
 from lsvision.report.progress import ProgressBars, progress_bars
+from lsvision.schema import Positive, PositiveInt, Scale, Text
 from lsvision.simulation import (
     Acquisition,
     EncoderConfig,
@@ -31,7 +31,8 @@ log = logging.getLogger(__name__)
 class SimulateSettings(RunSettings):
     """Options of the experiment.
 
-    ``scale`` = 4 means a quarter of the pixels at four times the pitch. ``lines`` is as many as the target needs where
+    ``scale`` = 4 means a quarter of the pixels at four times the pitch, 1 the full camera, whose line pitch is
+    ``line_pitch_mm``. ``lines`` is as many as the target needs where
     it is None. ``output`` is the scan folder to write, ``scan`` in the run's folder where it is None. With ``depth``
     the scan has the true depth map of the left image in place of the right image, as a camera with a matcher of its
     own writes.
@@ -43,19 +44,17 @@ class SimulateSettings(RunSettings):
     motion: MotionConfig
     sensor: SensorConfig
     encoder: EncoderConfig
-    scale: float = 4.0
-    line_pitch_mm: float = 0.07
-    lines: int | None = None
+    scale: Scale = 4.0
+    line_pitch_mm: Positive = 0.07
+    lines: PositiveInt | None = None
     transport: Transport = "forward"
     depth: bool = False
-    strip_lines: int = 256
-    output: str | None = None
+    strip_lines: PositiveInt = 256
+    output: Text | None = None
 
 
 def run_simulate(settings: SimulateSettings, folder: Path) -> None:
     """Render the scene and write it as a scan folder."""
-    if settings.scale < 1:
-        raise ConfigError(f"scale: expected at least 1 (the full camera), got {settings.scale}")
     simulation = simulate(
         scaled_rig(settings.rig, settings.scale),
         settings.board,
@@ -88,14 +87,16 @@ def write_simulation(
 
     write_scan(
         target,
-        rig=simulation.rig,
-        travel=simulation.travel,
-        left=counted(simulation.strips("left", strip_lines)),
-        right=None if depth else counted(simulation.strips("right", strip_lines)),
-        depth=counted(strip[..., None] for strip in simulation.depth_strips(strip_lines)) if depth else None,
-        lines=simulation.lines,
-        channels=simulation.channels,
-        dtype=torch.uint16 if simulation.sensor.bits == 16 else torch.uint8,
-        color_registered=simulation.sensor.color_registered,
-        extra_json={"truth.json": simulation.truth()},
+        NewScan(
+            rig=simulation.rig,
+            travel=simulation.travel,
+            left=counted(simulation.strips("left", strip_lines)),
+            right=None if depth else counted(simulation.strips("right", strip_lines)),
+            depth=counted(strip[..., None] for strip in simulation.depth_strips(strip_lines)) if depth else None,
+            lines=simulation.lines,
+            channels=simulation.channels,
+            dtype=torch.uint16 if simulation.sensor.bits == 16 else torch.uint8,
+            color_registered=simulation.sensor.color_registered,
+            extra_json={"truth.json": simulation.truth()},
+        ),
     )

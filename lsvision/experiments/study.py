@@ -1,17 +1,16 @@
 """``+experiment=study``: how good a calibration would be, by Monte Carlo through the library's own calibration."""
 
-import json
 import logging
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 
 import polars
 
-from lsvision.errors import ConfigError
 from lsvision.experiments.settings import RunSettings
-from lsvision.io import write_text
+from lsvision.io import write_json
 from lsvision.io.atomic import partial_file
 from lsvision.report import Study, study_report
+from lsvision.schema import IntFrom2, Positive, PositiveInt, Text
 from lsvision.simulation import BoardPose
 from lsvision.stages.calibration.config import CalibrationConfig
 from lsvision.study.map import tilt_map
@@ -22,34 +21,39 @@ from lsvision.types import Board, Rig
 
 log = logging.getLogger(__name__)
 
+_SLOWEST = ("boards", "method")
+
+
+def axes_not_studied() -> dict[str, list[float | int | str] | None]:
+    """Every condition, with no values to study; the boards and the method vary slowest."""
+    return dict.fromkeys(sorted((item.name for item in fields(Conditions)), key=lambda name: name not in _SLOWEST))
+
 
 @dataclass(frozen=True, kw_only=True)
 class StudySettings(RunSettings):
     """Options of the experiment.
 
     ``placings`` are sets of board poses by name, ``conditions`` what every point has but for the ``axes``: lists of
-    values by name of a condition, whose grid is studied. ``runs`` calibrations a point are made, ``batch`` at a time;
-    the batch changes the speed and the memory, not the result. ``calibration`` holds what the conditions do not.
+    values by name of a condition, whose grid is studied; None leaves a condition as it is. ``runs`` calibrations are
+    made per point, ``batch`` at a time; the batch changes the speed and the memory, not the result. ``calibration``
+    holds what the conditions do not.
     """
 
-    title: str
+    title: Text
     rig: Rig
     board: Board
     placings: dict[str, list[BoardPose]]
     conditions: Conditions
     calibration: CalibrationConfig
-    axes: dict[str, list[float | int | str] | None] = field(default_factory=dict)
-    runs: int = 500
-    batch: int = 256
-    map_range_deg: float = 15.0
-    map_steps: int = 31
+    axes: dict[str, list[float | int | str] | None] = field(default_factory=axes_not_studied)
+    runs: PositiveInt = 500
+    batch: PositiveInt = 256
+    map_range_deg: Positive = 15.0
+    map_steps: IntFrom2 = 21
 
 
 def run_study(settings: StudySettings, folder: Path) -> None:
     """Calibrate every point many times, write the tables, the summary and the report."""
-    for name in ("runs", "batch", "threads"):
-        if getattr(settings, name) < 1:
-            raise ConfigError(f"{name}: expected at least 1, got {getattr(settings, name)}")
     points = study_points(settings.conditions, settings.axes)
     corners = [exact_corners(settings.rig, settings.board, settings.placings, point) for point in points]
     log.info("%d points of %d calibrations each", len(points), settings.runs)
@@ -66,7 +70,7 @@ def run_study(settings: StudySettings, folder: Path) -> None:
     )
     for name in ("runs", "points", "iterations"):
         _write_parquet(getattr(study, name), folder / f"{name}.parquet")
-    write_text(folder / "summary.json", json.dumps(_summary(study), indent=2) + "\n")
+    write_json(folder / "summary.json", _summary(study))
     study_report(study, asdict(settings), folder)
     log.info("wrote %s and runs, points and iterations as Parquet beside it", folder / "report.html")
 

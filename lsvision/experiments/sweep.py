@@ -6,7 +6,6 @@ results of a job are read from its folder alone, so the launcher does not matter
 
 import json
 import logging
-import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -14,14 +13,14 @@ from pathlib import Path
 from typing import Any
 
 import polars
-from hydra.experimental.callback import Callback
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import OmegaConf
 
 from lsvision.errors import ConfigError, LsvisionError
 from lsvision.experiments.settings import RunSettings
-from lsvision.io import write_text
+from lsvision.io import write_json
 from lsvision.io.atomic import partial_file
 from lsvision.report import SweepJob, sweep_report
+from lsvision.schema import PositiveInt, Text
 
 log = logging.getLogger(__name__)
 
@@ -32,7 +31,8 @@ _RECORD, _SUMMARY = "job.json", "summary.json"
 class CollectSettings(RunSettings):
     """Options of ``+experiment=collect``; ``sweep`` is the folder of a sweep whose submitting process has ended."""
 
-    sweep: str
+    sweep: Text
+    threads: PositiveInt = 1
 
 
 def run_collect(settings: CollectSettings, folder: Path) -> None:
@@ -41,19 +41,6 @@ def run_collect(settings: CollectSettings, folder: Path) -> None:
     if not sweep.is_dir():
         raise ConfigError(f"sweep: no folder {sweep}")
     collect_sweep(sweep)
-
-
-class SweepReport(Callback):
-    """Hydra's hook at the end of a sweep."""
-
-    def on_multirun_end(self, config: DictConfig, **_: Any) -> None:
-        """Write the sweep's table and report; exit code 1 where a job failed."""
-        jobs = collect_sweep(Path(config.hydra.sweep.dir))
-        failed = [job for job in jobs if job.reason]
-        for job in failed:
-            print(f"error: job {job.name} ({' '.join(job.overrides)}): {job.reason}", file=sys.stderr)
-        if failed:
-            raise SystemExit(1)
 
 
 def run_job(experiment: Callable[[], None], folder: Path, overrides: Sequence[str]) -> Exception | None:
@@ -68,7 +55,7 @@ def run_job(experiment: Callable[[], None], folder: Path, overrides: Sequence[st
         "seconds": round(time.time() - begin, 3),
         "reason": "" if failure is None else _reason(failure),
     }
-    write_text(folder / _RECORD, json.dumps(record, indent=2) + "\n")
+    write_json(folder / _RECORD, record)
     return failure
 
 

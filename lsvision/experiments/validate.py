@@ -1,8 +1,6 @@
 """``+experiment=validate``: re-read a product, every chunk against its checksum, and measure the board in it if any."""
 
-import json
 import logging
-import math
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -10,7 +8,8 @@ import torch
 from torch import Tensor
 
 from lsvision.experiments.settings import RunSettings
-from lsvision.io import Product, check_product, read_product, write_text
+from lsvision.io import Product, check_product, read_product, write_json
+from lsvision.schema import Text
 from lsvision.stages.measurement import measure_board
 from lsvision.types import Board, ProductGrid
 
@@ -21,7 +20,7 @@ log = logging.getLogger(__name__)
 class ValidateSettings(RunSettings):
     """Options of the experiment: a product, and the board that may be seen in it."""
 
-    product: str
+    product: Text
     board: Board
 
 
@@ -59,7 +58,7 @@ def run_validate(settings: ValidateSettings, folder: Path) -> None:
     )  # fmt: skip
     grid = ProductGrid(*product.shape, product.pitch_mm, *product.origin_mm)
     board = measure_board(ProductImage(product, "color"), ProductImage(product, "height"), grid, settings.board)
-    summary = {name: value if math.isfinite(value) else None for name, value in asdict(check).items()}
+    summary: dict[str, object] = asdict(check)
     if board is None:
         log.info("no board of %d x %d squares in it", settings.board.columns, settings.board.rows)
         summary["board"] = None
@@ -74,4 +73,4 @@ def run_validate(settings: ValidateSettings, folder: Path) -> None:
             "neighbour_rms_mm": board.neighbour_rms_mm,
             "distance_rms_mm": board.distance_rms_mm,
         }
-    write_text(folder / "summary.json", json.dumps(summary, indent=2) + "\n")
+    write_json(folder / "summary.json", summary)

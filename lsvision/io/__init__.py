@@ -5,9 +5,10 @@ from lsvision.io.formats.calibration import check_rig_match, read_calibration, w
 from lsvision.io.formats.checksum import scan_sha256
 from lsvision.io.formats.encoder import read_encoder, write_encoder
 from lsvision.io.formats.rig import read_rig, rig_from_dict, rig_to_dict, write_rig
-from lsvision.io.formats.scan import read_scan, write_scan
+from lsvision.io.formats.scan import NewScan, read_scan, scan_files, write_scan
 from lsvision.io.images.line_image import open_line_image
 from lsvision.io.images.tiff import write_line_image
+from lsvision.io.json_file import finite_or_null, write_json
 from lsvision.io.product.check import ProductCheck, check_product
 from lsvision.io.product.export import ExportFormat, export_product
 from lsvision.io.product.las import write_laz
@@ -17,6 +18,7 @@ from lsvision.io.product.writer import ProductLayout, ProductRows, ProductWriter
 
 __all__ = [
     "ExportFormat",
+    "NewScan",
     "Product",
     "ProductCheck",
     "ProductLayout",
@@ -27,6 +29,7 @@ __all__ = [
     "complete_product",
     "create_product",
     "export_product",
+    "finite_or_null",
     "open_line_image",
     "read_calibration",
     "read_encoder",
@@ -36,9 +39,11 @@ __all__ = [
     "remove_left_over",
     "rig_from_dict",
     "rig_to_dict",
+    "scan_files",
     "scan_sha256",
     "write_calibration",
     "write_encoder",
+    "write_json",
     "write_laz",
     "write_line_image",
     "write_ply",

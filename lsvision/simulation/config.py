@@ -1,10 +1,13 @@
 """Options of a simulated scan: scene, motion, sensor, encoder."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from typing import Literal
+
+from lsvision.schema import AcuteAngle, Checked, NonNegative, Positive, PositiveInt, Seed, Wavelengths
 
 
 @dataclass(frozen=True)
-class SceneConfig:
+class SceneConfig(Checked):
     """The object under the cameras.
 
     A board or sheet is turned by ``R = Rz(yaw) Ry(roll) Rx(pitch)`` about its centre, which crosses the scan plane
@@ -13,29 +16,35 @@ class SceneConfig:
     plane along the motion, ``conveyor_drop_mm`` behind the plane of zero disparity, and is hidden by any target.
     """
 
-    kind: str = "board"  # board, sheet or rail
+    kind: Literal["board", "sheet", "rail"] = "board"
     pitch_deg: float = 0.0
     roll_deg: float = 0.0
     yaw_deg: float = 0.0
     depth_offset_mm: float = 0.0
-    margin_mm: float = 20.0  # conveyor seen before and after a board or sheet
-    texture_mm: float = 0.4  # finest detail of every surface
-    board_border_x_mm: float = 20.0  # white beside the squares; a GP400 plate measures 400 x 300 mm
-    board_border_y_mm: float = 15.0
-    board_texture: float = 0.06  # relative contrast on the board
-    sheet_width_mm: float = 360.0
-    sheet_height_mm: float = 270.0
-    rail_length_mm: float = 400.0
-    rail_rise_mm: float = 22.0
-    rail_texture: float = 0.16
-    defect_spacing_mm: float = 120.0  # one scratch and one pit in each such length of rail; 0 for a flawless rail
-    roll_mark_period_mm: float = 150.0  # circumference of the damaged roll; 0 for none
-    conveyor_drop_mm: float = 26.0
-    seed: int = 0
+    margin_mm: NonNegative = 20.0  # conveyor seen before and after a board or sheet
+    texture_mm: Positive = 0.4  # finest detail of every surface
+    board_border_x_mm: NonNegative = 20.0  # white beside the squares; a GP400 plate measures 400 x 300 mm
+    board_border_y_mm: NonNegative = 15.0
+    board_texture: NonNegative = 0.06  # relative contrast on the board
+    sheet_width_mm: Positive = 360.0
+    sheet_height_mm: Positive = 270.0
+    rail_length_mm: Positive = 400.0
+    rail_rise_mm: float = 22.0  # of the crown over the plane of zero disparity
+    rail_texture: NonNegative = 0.16
+    defect_spacing_mm: NonNegative = 120.0  # one scratch and one pit per length of rail; 0: none
+    roll_mark_period_mm: NonNegative = 150.0  # circumference of the damaged roll; 0: none
+    conveyor_drop_mm: float = 26.0  # of the conveyor under the plane of zero disparity
+    seed: Seed = 0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for key in ("pitch_deg", "yaw_deg"):
+            if self.kind == "rail" and getattr(self, key) != 0:
+                raise self.fault(key, f"expected 0, as a rail runs along the motion, got {getattr(self, key)}")
 
 
 @dataclass(frozen=True)
-class MotionConfig:
+class MotionConfig(Checked):
     """Motion of the object: a constant direction and stretch, and a smooth vibration of zero mean.
 
     The amplitudes are rms values. Each of x, z and roll is a sum of equal sine waves of the listed wavelengths (in mm
@@ -43,32 +52,32 @@ class MotionConfig:
     cameras on the plane of zero disparity.
     """
 
-    angle_x_deg: float = 0.0  # atan2(n1, n2)
-    angle_z_deg: float = 0.0  # atan2(n3, n2)
-    stretch: float = 1.0
-    vibration_x_mm: float = 0.0
-    vibration_z_mm: float = 0.0
-    vibration_roll_deg: float = 0.0
-    vibration_wavelengths_mm: list[float] = field(default_factory=lambda: [233.0, 97.0, 61.0])
-    seed: int = 0
+    angle_x_deg: AcuteAngle = 0.0  # atan2(n1, n2)
+    angle_z_deg: AcuteAngle = 0.0  # atan2(n3, n2)
+    stretch: Positive = 1.0
+    vibration_x_mm: NonNegative = 0.0
+    vibration_z_mm: NonNegative = 0.0
+    vibration_roll_deg: NonNegative = 0.0
+    vibration_wavelengths_mm: Wavelengths = (233.0, 97.0, 61.0)
+    seed: Seed = 0
 
 
 @dataclass(frozen=True)
-class SensorConfig:
+class SensorConfig(Checked):
     """The pair of line sensors and the optics before them."""
 
-    noise: float = 1.5  # standard deviation, of 255
-    blur_px: float = 0.6  # standard deviation of the optics' point spread
-    exposure: float = 0.95  # grey value, of 1, of a perfectly white surface facing the cameras midway
-    bits: int = 8  # 8 or 16
+    noise: NonNegative = 1.5  # standard deviation, of 255
+    blur_px: NonNegative = 0.6  # standard deviation of the optics' point spread
+    exposure: Positive = 0.95  # grey value, of 1, of a perfectly white surface facing the cameras midway
+    bits: Literal[8, 16] = 8
     mono: bool = False
-    supersampling: int = 3  # samples per pixel along the sensor, and per line along the motion
+    supersampling: PositiveInt = 3  # samples per pixel along the sensor, and per line along the motion
     color_registered: bool = True  # the camera has shifted its colour lines by their nominal spacing
-    seed: int = 0
+    seed: Seed = 0
 
 
 @dataclass(frozen=True)
-class EncoderConfig:
+class EncoderConfig(Checked):
     """Unevenly triggered lines and the encoder's log of their positions.
 
     If ``enabled``, the true nominal position of a line swings by ``wobble_mm`` (rms) about the constant pitch. The log
@@ -76,14 +85,14 @@ class EncoderConfig:
     """
 
     enabled: bool = False
-    wobble_mm: float = 0.3
-    wobble_wavelengths_mm: list[float] = field(default_factory=lambda: [390.0, 151.0])
-    noise_mm: float = 0.002
-    seed: int = 0
+    wobble_mm: NonNegative = 0.3
+    wobble_wavelengths_mm: Wavelengths = (390.0, 151.0)
+    noise_mm: NonNegative = 0.002
+    seed: Seed = 0
 
 
 @dataclass(frozen=True)
-class BoardPose:
+class BoardPose(Checked):
     """Tilt and depth of a board under the cameras, as in ``SceneConfig``."""
 
     pitch_deg: float

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from lsvision.errors import ConfigError
 from lsvision.geometry import Camera, project
+from lsvision.schema import Checked, Positive, PositiveInt
 from lsvision.simulation.config import EncoderConfig, MotionConfig, SceneConfig, SensorConfig
 from lsvision.simulation.noise import lattice_hash
 from lsvision.simulation.scene import build_scene, place, scene_lines
@@ -26,7 +27,7 @@ _LOG_STREAM = 7
 
 
 @dataclass(frozen=True)
-class Acquisition:
+class Acquisition(Checked):
     """How the lines of a scan are triggered.
 
     Attributes:
@@ -36,8 +37,8 @@ class Acquisition:
         encoder: uneven trigger and its log; None for a constant pitch.
     """
 
-    line_pitch_mm: float
-    lines: int | None = None
+    line_pitch_mm: Positive
+    lines: PositiveInt | None = None
     transport: Transport = "forward"
     encoder: EncoderConfig | None = None
 
@@ -166,7 +167,6 @@ def simulate(
     Raises:
         ConfigError: an option has a value that no scan can have; the message names it.
     """
-    _check(scene, sensor, motion, acquisition)
     pitch = acquisition.line_pitch_mm
     trajectory = Trajectory(rig, motion, acquisition.encoder or EncoderConfig(), pitch, acquisition.transport)
     lines = acquisition.lines
@@ -188,26 +188,6 @@ def _logged_travel(trajectory: Trajectory, lines: int) -> Travel:
     if not bool((log.diff() > 0).all()):
         raise ConfigError("encoder.wobble_mm, encoder.noise_mm: too large for this line pitch, the log runs backwards")
     return Travel(pitch, log, trajectory.transport)
-
-
-def _check(scene: SceneConfig, sensor: SensorConfig, motion: MotionConfig, acquisition: Acquisition) -> None:
-    problems = {
-        "line_pitch_mm: must be positive": acquisition.line_pitch_mm > 0,
-        "lines: must be at least 1": acquisition.lines is None or acquisition.lines >= 1,
-        "scene.kind: must be board, sheet or rail": scene.kind in ("board", "sheet", "rail"),
-        "scene.texture_mm: must be positive": scene.texture_mm > 0,
-        "scene: a rail runs along the motion; pitch_deg and yaw_deg must be 0": scene.kind != "rail"
-        or (scene.pitch_deg == 0 and scene.yaw_deg == 0),
-        "sensor.bits: must be 8 or 16": sensor.bits in (8, 16),
-        "sensor.supersampling: must be at least 1": sensor.supersampling >= 1,
-        "sensor.blur_px: must not be negative": sensor.blur_px >= 0,
-        "motion.stretch: must be positive": motion.stretch > 0,
-        "motion.vibration_wavelengths_mm: must hold positive lengths": bool(motion.vibration_wavelengths_mm)
-        and min(motion.vibration_wavelengths_mm) > 0,
-    }
-    for problem, fine in problems.items():
-        if not fine:
-            raise ConfigError(problem)
 
 
 def _regroup(blocks: Iterator[Tensor], strip_lines: int, total: int) -> Iterator[Tensor]:

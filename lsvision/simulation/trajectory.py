@@ -157,7 +157,7 @@ def cast_rays(trajectory: Trajectory, camera: Camera, columns: Tensor, lines: Te
     return Rays(slope.float(), origin, across, depth + middle_slope * across, camera_x, middle_slope)
 
 
-def _waves(y: Tensor, wavelengths_mm: list[float], seed: int, stream: int) -> Tensor:
+def _waves(y: Tensor, wavelengths_mm: tuple[float, ...], seed: int, stream: int) -> Tensor:
     """Sum of equal sine waves with random phases and an rms of one."""
     count = len(wavelengths_mm)
     phase = math.pi * lattice_hash(torch.arange(count), stream, seed).double()

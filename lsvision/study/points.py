@@ -4,13 +4,14 @@ import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
+from typing import Any
 
-import dacite
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from lsvision.errors import ConfigError
+from lsvision.schema import AcuteAngle, Checked, NonNegative, OptionError, Positive, PositiveInt, Text
 from lsvision.simulation import Acquisition, BoardPose, MotionConfig, SceneConfig, SensorConfig, Simulation, simulate
 from lsvision.stages.calibration.config import CalibrationConfig
 from lsvision.stages.calibration.linearise import motion_information
@@ -22,7 +23,7 @@ _LINE_PITCH_MM = 0.07
 
 
 @dataclass(frozen=True)
-class Conditions:
+class Conditions(Checked):
     """One point of a study: the boards' placing, the installation, disturbances of the corners, and the method for n.
 
     ``corner_sigma_mm`` is the white noise of x and of the travel, ``depth_sigma_mm`` that of z; the calibration knows
@@ -30,19 +31,19 @@ class Conditions:
     phases in every scan.
     """
 
-    boards: str
-    angle_x_deg: float = 0.0
-    angle_z_deg: float = 0.0
-    stretch: float = 1.0
-    corner_sigma_mm: float = 0.02
-    depth_sigma_mm: float = 0.014
-    vibration_mm: float = 0.0
-    vibration_wavelength_mm: float = 100.0
-    encoder_mm: float = 0.0
-    encoder_wavelength_mm: float = 400.0
-    prior_sigma: float = 0.05
+    boards: Text
+    angle_x_deg: AcuteAngle = 0.0
+    angle_z_deg: AcuteAngle = 0.0
+    stretch: Positive = 1.0
+    corner_sigma_mm: Positive = 0.02
+    depth_sigma_mm: Positive = 0.014
+    vibration_mm: NonNegative = 0.0
+    vibration_wavelength_mm: Positive = 100.0
+    encoder_mm: NonNegative = 0.0
+    encoder_wavelength_mm: Positive = 400.0
+    prior_sigma: Positive = 0.05
     method: CalibrationMethod = "joint"
-    iterations: int = 20
+    iterations: PositiveInt = 20
 
     def calibration(self, config: CalibrationConfig) -> CalibrationConfig:
         """The calibration's options with those of this point."""
@@ -87,7 +88,7 @@ def study_points(base: Conditions, axes: Mapping[str, Sequence[float | int | str
     """The grid of all axes, the last one fastest, over the base's conditions; an axis of None stays at its value.
 
     Raises:
-        ConfigError: an axis that is no condition or is empty, or a value of the wrong type.
+        ConfigError: an axis that is no condition, is empty, or holds a value that the condition cannot have.
     """
     known = [item.name for item in fields(Conditions)]
     varied = {name: values for name, values in axes.items() if values is not None}
@@ -96,11 +97,13 @@ def study_points(base: Conditions, axes: Mapping[str, Sequence[float | int | str
             raise ConfigError(f"axes.{name}: unknown; expected one of {', '.join(known)}")
         if not values:
             raise ConfigError(f"axes.{name}: the list is empty")
-    combinations = [dict(zip(varied, values, strict=True)) for values in itertools.product(*varied.values())]
+    combinations: list[dict[str, Any]] = [
+        dict(zip(varied, values, strict=True)) for values in itertools.product(*varied.values())
+    ]
     try:
-        return [dacite.from_dict(Conditions, {**asdict(base), **values}) for values in combinations]
-    except dacite.WrongTypeError as error:
-        raise ConfigError(f"axes.{error.field_path}: {error.value!r} is not a value of it") from error
+        return [replace(base, **values) for values in combinations]
+    except OptionError as error:
+        raise ConfigError(f"axes.{error.key}: {error.problem}") from error
 
 
 def exact_corners(
@@ -133,9 +136,6 @@ def exact_corners(
 def noise_chol(conditions: Conditions) -> Float[Tensor, "3 3"]:
     """Cholesky factor of the covariance of a corner that the calibration assumes, mm."""
     corner, depth = conditions.corner_sigma_mm, conditions.depth_sigma_mm
-    for name, value in (("corner_sigma_mm", corner), ("depth_sigma_mm", depth)):
-        if not value > 0:
-            raise ConfigError(f"{name}: expected a positive number, got {value}")
     return torch.diag(torch.tensor([corner, corner, depth], dtype=torch.float64))
 
 

@@ -14,7 +14,7 @@ from pathlib import Path
 import torch
 
 from lsvision.geometry import zero_disparity_mm
-from lsvision.io import read_product, write_calibration, write_scan
+from lsvision.io import NewScan, read_product, write_calibration, write_scan
 from lsvision.types import Calibration, Motion, Observability, Rig, Travel
 
 RIG = Rig(1786, 40.0, 113.84, 354.0, 260.125, 1524.375)
@@ -68,16 +68,19 @@ def _make_archive(root: Path) -> Path:
         stereo = number % 2 == 1
         write_scan(
             root / f"small{number:03}",
-            rig=RIG,
-            travel=Travel(PITCH),
-            left=[left[lines]],
-            right=[right[lines]] if stereo else None,
-            depth=None if stereo else [depth],
-            lines=SMALL_LINES,
+            NewScan(
+                rig=RIG,
+                travel=Travel(PITCH),
+                left=[left[lines]],
+                right=[right[lines]] if stereo else None,
+                depth=None if stereo else [depth],
+                lines=SMALL_LINES,
+            ),
         )
     repeats = LARGE_LINES // PATTERN_LINES
     write_scan(
-        root / "large", rig=RIG, travel=Travel(PITCH), left=[left] * repeats, right=[right] * repeats, lines=LARGE_LINES
+        root / "large",
+        NewScan(rig=RIG, travel=Travel(PITCH), left=[left] * repeats, right=[right] * repeats, lines=LARGE_LINES),
     )
     motion = Motion(torch.tensor([0.02, 1.02, -0.01]).double(), 1e-8 * torch.eye(3).double())
     path = root / "calibration.json"

@@ -31,7 +31,15 @@ from lsvision.archive import (
 from lsvision.archive.engines.dask import DaskEngine
 from lsvision.archive.tasks import Task, TaskResult
 from lsvision.image.tiling import keep_freed_memory
-from lsvision.io import ProductLayout, ProductWriter, read_calibration, read_scan, write_calibration, write_scan
+from lsvision.io import (
+    NewScan,
+    ProductLayout,
+    ProductWriter,
+    read_calibration,
+    read_scan,
+    write_calibration,
+    write_scan,
+)
 from lsvision.stages.correction.config import CorrectionConfig
 from lsvision.stages.correction.correct import correct_scan
 from lsvision.stages.correction.grid import plan_product
@@ -66,7 +74,8 @@ def make_archive(root: Path) -> Path:
         texture = torch.nn.functional.avg_pool2d(noise, 3, 1, 1)[:, 0].movedim(0, -1)
         left = ((texture - 0.5) * 400 + 128).clamp(0, 255).to(torch.uint8)
         write_scan(
-            root / f"scan{number}", rig=RIG, travel=Travel(0.28), left=[left], right=[left.roll(-4, 1)], lines=LINES
+            root / f"scan{number}",
+            NewScan(rig=RIG, travel=Travel(0.28), left=[left], right=[left.roll(-4, 1)], lines=LINES),
         )
     motion = Motion(torch.tensor([0.02, 1.02, -0.01]).double(), 1e-8 * torch.eye(3).double())
     path = root / "calibration.json"

@@ -20,7 +20,7 @@ from lsvision.archive import (
     run_jobs,
     scan_job,
 )
-from lsvision.io import read_product, write_calibration, write_scan
+from lsvision.io import NewScan, read_product, write_calibration, write_scan
 from lsvision.stages.correction.config import CorrectionConfig
 from lsvision.stages.disparity.config import DisparityConfig
 from lsvision.types import Calibration, Motion, Observability, Rig, Travel
@@ -42,13 +42,15 @@ def make_scan(folder: Path, lines: int = 96, seed: int = 0, *, stereo: bool = Fa
     depth = RIG.zero_disparity_mm + 5.0 * torch.rand(lines, WIDTH, 1, generator=random)
     write_scan(
         folder,
-        rig=options.pop("rig", RIG),
-        travel=Travel(1.12),
-        left=[left],
-        right=[left.roll(1, dims=1)] if stereo else None,
-        depth=None if stereo else [depth],
-        lines=lines,
-        **options,
+        NewScan(
+            rig=options.pop("rig", RIG),
+            travel=Travel(1.12),
+            left=[left],
+            right=[left.roll(1, dims=1)] if stereo else None,
+            depth=None if stereo else [depth],
+            lines=lines,
+            **options,
+        ),
     )
     return folder
 

@@ -35,8 +35,8 @@ def scans(tmp_path_factory):
                     f"output={folder / name}",
                 ],
             )
-            run, schema = EXPERIMENTS["simulate"]
-            run(build_settings(schema, OmegaConf.to_container(config, resolve=True)), folder)
+            experiment = EXPERIMENTS["simulate"]
+            experiment.run(build_settings(experiment.schema, OmegaConf.to_container(config, resolve=True)), folder)
     return folder
 
 

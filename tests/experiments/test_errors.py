@@ -1,6 +1,9 @@
 """Bad input: one line with the path or the option, exit code 1, nothing half-written."""
 
 import shutil
+import subprocess
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -64,8 +67,8 @@ def test_a_bad_scan_is_one_line_with_its_path(case, scan, command, capsys, tmp_p
     [
         (["+experiment=calibrate"], "scans: the list is empty"),
         (["+experiment=calibrate", "scans=[nowhere]"], "nowhere"),
-        (["+experiment=calibrate", "scans=[x]", "calibration.method=jont"], "calibration.method: expected joint"),
-        (["+experiment=calibrate", "scans=[x]", "+spam=1"], "spam: unknown option"),
+        (["+experiment=calibrate", "scans=[x]", "calibration.method=jont"], "calibration.method: expected 'joint', "),
+        (["+experiment=calibrate", "scans=[x]", "+spam=1"], "spam: unknown key"),
         (["+experiment=correct", "scan=x"], "calibration"),
         (["+experiment=correct", "scan=nowhere", "calibration=none.json"], "nowhere"),
         (["+experiment=simulate", "scale=0.5"], "scale"),
@@ -77,6 +80,23 @@ def test_a_bad_option_is_one_line_that_names_it(overrides, told, command, capsys
     errors = capsys.readouterr().err.splitlines()
     assert len(errors) == 1
     assert told in errors[0]
+
+
+@pytest.mark.parametrize(
+    ("overrides", "problem"),
+    [
+        (["+experiment=correct", "scan=x", "calibration=y", "correction.strip_rows=0"], "correction.strip_rows: "),
+        (["+experiment=correct", "scan=x", "calibration=y", "export=[obj]"], "export[0]: "),
+        (["+experiment=validate", "product=x", "threads=0"], "threads: "),
+        (["+experiment=reprocess", "archive=x", "calibration=y", "output=z", "engine.workers=0"], "engine.workers: "),
+    ],
+)
+def test_an_option_out_of_range_ends_the_program_with_one_line(overrides, problem, tmp_path):
+    arguments = [sys.executable, "-m", "lsvision.run", *overrides, f"hydra.run.dir={tmp_path}"]
+    done = subprocess.run(arguments, cwd=Path(__file__).parents[2], capture_output=True, text=True, timeout=100)
+    assert done.returncode == 1
+    (line,) = done.stderr.splitlines()
+    assert line.startswith(f"error: {problem}expected ")
 
 
 def test_an_unknown_option_fails_naming_it(command, capsys):
@@ -120,4 +140,6 @@ def test_help_and_configuration_are_readable(command, capsys):
     assert command("--help") == 0
     assert "+experiment=paper" in capsys.readouterr().out
     assert command("--cfg", "job", "+experiment=correct", "scan=x", "calibration=y") == 0
-    assert "height_range_mm" in capsys.readouterr().out
+    shown = capsys.readouterr().out
+    for option in ("height_range_mm", "strip_rows: 512", "repair_encoder: false", "matcher: auto", "output: null"):
+        assert option in shown

@@ -12,7 +12,7 @@ import tifffile
 import torch
 import zarr.storage._local
 
-from lsvision.io import read_calibration, read_product, read_scan, write_calibration, write_encoder, write_scan
+from lsvision.io import NewScan, read_calibration, read_product, read_scan, write_calibration, write_encoder, write_scan
 from lsvision.simulation import Acquisition, SceneConfig, SensorConfig, Simulation, simulate
 from lsvision.types import Calibration, Motion, Observability
 from tests.stages.rendered import BOARD, MOTION, PITCH, SMALL_RIG
@@ -35,12 +35,14 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     simulation = simulate(SMALL_RIG, BOARD, board, MOTION, SensorConfig(supersampling=3), Acquisition(PITCH))
     write_scan(
         folder / "scan",
-        rig=simulation.rig,
-        travel=simulation.travel,
-        left=simulation.strips("left"),
-        right=None,
-        depth=(strip[..., None] for strip in simulation.depth_strips()),
-        lines=simulation.lines,
+        NewScan(
+            rig=simulation.rig,
+            travel=simulation.travel,
+            left=simulation.strips("left"),
+            right=None,
+            depth=(strip[..., None] for strip in simulation.depth_strips()),
+            lines=simulation.lines,
+        ),
     )
     write_calibration(calibration_of(simulation), folder / "calibration.json")
     return folder
@@ -104,7 +106,7 @@ def truncate(scan: Path) -> None:
 def one_line(scan: Path) -> None:
     read = read_scan(scan)
     left, depth = [read.left.read(0, 1)], [read.images.depth.read(0, 1)]
-    write_scan(scan, rig=read.rig, travel=read.travel, left=left, right=None, depth=depth, lines=1)
+    write_scan(scan, NewScan(rig=read.rig, travel=read.travel, left=left, right=None, depth=depth, lines=1))
 
 
 def short_log(scan: Path) -> None:

@@ -10,8 +10,6 @@ import pytest
 
 from lsvision import run
 from lsvision.errors import CalibrationError
-from lsvision.experiments import EXPERIMENTS
-from lsvision.experiments.study import StudySettings
 from lsvision.experiments.sweep import collect_sweep
 from lsvision.io import write_text
 
@@ -31,7 +29,7 @@ def toy(monkeypatch):
         write_text(folder / "summary.json", json.dumps({"still": values, "long": list(range(9)), "ok": True}))
         write_text(folder / "report.html", "<p>of the job</p>")
 
-    monkeypatch.setitem(EXPERIMENTS, "study", (experiment, StudySettings))
+    monkeypatch.setattr("lsvision.experiments.study.run_study", experiment)
 
 
 def test_twelve_jobs_of_which_two_fail(toy, command, tmp_path, capsys):

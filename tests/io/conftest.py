@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from lsvision.io import write_scan
+from lsvision.io import NewScan, write_scan
 from lsvision.types import (
     BoardFit,
     Calibration,
@@ -34,7 +34,7 @@ def images() -> tuple[torch.Tensor, torch.Tensor]:
 
 @pytest.fixture
 def make_scan(tmp_path: Path, small_rig: Rig, images) -> Callable[..., Path]:
-    """Write a small scan; keyword arguments replace those of ``write_scan``."""
+    """Write a small scan; keyword arguments replace those of ``NewScan``."""
 
     def make(name: str = "scan", **changes: object) -> Path:
         left, right = images
@@ -45,7 +45,7 @@ def make_scan(tmp_path: Path, small_rig: Rig, images) -> Callable[..., Path]:
             "right": [right],
             "lines": LINES,
         }
-        write_scan(tmp_path / name, **(arguments | changes))
+        write_scan(tmp_path / name, NewScan(**(arguments | changes)))
         return tmp_path / name
 
     return make

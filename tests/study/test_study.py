@@ -178,8 +178,8 @@ def test_points_are_the_grid_of_the_axes():
     [
         ({"spam": [1]}, r"axes\.spam: unknown; expected one of boards, "),
         ({"stretch": []}, r"axes\.stretch: the list is empty"),
-        ({"stretch": ["wide"]}, r"axes\.stretch: 'wide'"),
-        ({"method": ["guess"]}, r"axes\.method: 'guess'"),
+        ({"stretch": ["wide"]}, r"axes\.stretch: expected a finite number > 0, got 'wide'"),
+        ({"method": ["guess"]}, r"axes\.method: expected 'joint', .* got 'guess'"),
     ],
 )
 def test_a_wrong_axis_is_named(axes, message):

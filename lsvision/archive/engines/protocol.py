@@ -7,6 +7,7 @@ from types import TracebackType
 from typing import Literal, Protocol
 
 from lsvision.archive.tasks import Task, TaskResult
+from lsvision.schema import Checked, PositiveInt, Text
 
 # A strip that ended this many workers is given up.
 MOST_DEATHS = 3
@@ -16,7 +17,7 @@ Finished = tuple[Task, TaskResult]
 
 
 @dataclass(frozen=True)
-class EngineConfig:
+class EngineConfig(Checked):
     """Where strips are computed.
 
     ``workers`` is as many as cores and memory allow where it is None. ``worker_memory_mb`` bounds what one takes:
@@ -25,9 +26,9 @@ class EngineConfig:
     """
 
     kind: Literal["local", "dask"] = "local"
-    workers: int | None = None
-    worker_memory_mb: int = 2048
-    scheduler: str | None = None
+    workers: PositiveInt | None = None
+    worker_memory_mb: PositiveInt = 2048
+    scheduler: Text | None = None
 
 
 class Engine(Protocol):

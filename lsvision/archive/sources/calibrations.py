@@ -2,16 +2,29 @@
 
 import hashlib
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import date
 from pathlib import Path
+from typing import Annotated
 
 from lsvision.errors import CalibrationError, FileFormatError
 from lsvision.io import check_rig_match, read_calibration
-from lsvision.io.formats.validation import Fields, read_yaml
+from lsvision.io.formats.validation import named_file, read_entries, read_yaml
+from lsvision.schema import Checked, Says, Text
 from lsvision.types import Calibration, Scan
 
 LIST_FILE = "calibrations.yaml"
+
+Day = Annotated[date, Says("a day as 2024-05-31")]
+
+
+@dataclass(frozen=True)
+class ListedCalibration(Checked):
+    """A row of ``calibrations.yaml``."""
+
+    file: Text
+    first: Day | None = field(default=None, metadata={"key": "from"})
+    last: Day | None = field(default=None, metadata={"key": "to"})
 
 
 @dataclass(frozen=True)
@@ -45,7 +58,7 @@ def read_calibrations(path: Path | str) -> list[DatedCalibration]:
         listed = read_yaml(path / LIST_FILE)
         if not isinstance(listed, list) or not listed:
             raise FileFormatError(path / LIST_FILE, "expected a list of calibrations")
-        return [_read_listed(Fields(path / LIST_FILE, item, f"[{index}].")) for index, item in enumerate(listed)]
+        return [_read_listed(path / LIST_FILE, index, item) for index, item in enumerate(listed)]
     files = sorted(path.glob("*.json"))
     if not files:
         raise FileFormatError(path, f"expected {LIST_FILE} or calibrations as *.json")
@@ -93,13 +106,6 @@ def _read(path: Path, first: date | None = None, last: date | None = None) -> Da
     return DatedCalibration(path, calibration, hashlib.sha256(path.read_bytes()).hexdigest(), first, last)
 
 
-def _read_listed(fields: Fields) -> DatedCalibration:
-    days = []
-    for key in ("from", "to"):
-        value = fields.take(key) if fields.has(key) else None
-        if value is not None and (not isinstance(value, date) or hasattr(value, "hour")):
-            raise fields.error(key, f"expected a day as 2024-05-31, got {value!r}")
-        days.append(value)
-    file = fields.file("file")
-    fields.finish()
-    return _read(file, *days)
+def _read_listed(path: Path, index: int, item: object) -> DatedCalibration:
+    listed = read_entries(ListedCalibration, item, path, f"[{index}]")
+    return _read(named_file(path, f"[{index}].file", listed.file), listed.first, listed.last)

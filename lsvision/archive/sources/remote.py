@@ -12,7 +12,7 @@ from fsspec.implementations.local import LocalFileSystem
 
 from lsvision.archive.sources.catalogue import PATTERN_SIGNS, SCAN_FILE
 from lsvision.errors import ConfigError
-from lsvision.io import write_text
+from lsvision.io import write_json
 
 _MANIFEST = ".copied.json"
 # What tells cheaply that a file has changed; every file system knows some of them.
@@ -62,7 +62,7 @@ def _copy(files: fsspec.AbstractFileSystem, place: str, copies: Path) -> None:
             files.get_file(path, str(target))
         kept[name] = stamp
     if kept != before:
-        write_text(manifest, json.dumps(kept))
+        write_json(manifest, kept)
 
 
 def _stamps(files: fsspec.AbstractFileSystem, scans: list[str]) -> Iterator[tuple[str, str]]:

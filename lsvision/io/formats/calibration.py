@@ -1,18 +1,18 @@
 """The calibration file: ``calibration.json``."""
 
-import json
 import math
-from dataclasses import fields as dataclass_fields
+from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Literal, cast, get_args
+from typing import Literal
 
 import torch
 from torch import Tensor
 
-from lsvision.errors import CalibrationError
-from lsvision.io.atomic import write_text
-from lsvision.io.formats.rig import rig_from_dict, rig_to_dict
-from lsvision.io.formats.validation import Fields, read_json
+from lsvision.errors import CalibrationError, FileFormatError
+from lsvision.io.formats.rig import RigEntries, rig_to_dict
+from lsvision.io.formats.validation import Matrix, Triple, read_entries, read_json
+from lsvision.io.json_file import write_json
+from lsvision.schema import Checked, NonNegative, PositiveInt, Text
 from lsvision.types import (
     BoardFit,
     Calibration,
@@ -20,15 +20,100 @@ from lsvision.types import (
     Iteration,
     Motion,
     Observability,
-    ObservedDirection,
     Provenance,
     Scan,
 )
 
-CALIBRATION_FORMAT = "lsvision-calibration/1"
+CalibrationFormat = Literal["lsvision-calibration/1"]
+CALIBRATION_FORMAT: CalibrationFormat = "lsvision-calibration/1"
 
 # Rounding of a covariance that was computed as a product; a real fault is far larger.
 _COVARIANCE_ROUNDING = 1e-9
+
+
+@dataclass(frozen=True)
+class MotionEntries(Checked):
+    """Entry ``motion``; what follows from n is accepted whatever it says."""
+
+    n: Triple
+    covariance: Matrix
+    stretch: object = None
+    angles_deg: object = None
+    sigma: object = None
+
+    def motion(self, path: Path) -> Motion:
+        """The motion.
+
+        Raises:
+            FileFormatError: n does not advance along Y, or the covariance is none; names ``path``.
+        """
+        if self.n[1] <= 0:
+            raise FileFormatError(path, f"expected a number > 0, the travel along Y, got {self.n[1]}", "motion.n[1]")
+        covariance = _float64(self.covariance)
+        slack = _COVARIANCE_ROUNDING * float(covariance.abs().max())
+        if float((covariance - covariance.mT).abs().max()) > slack:
+            raise FileFormatError(path, "expected a symmetric matrix", "motion.covariance")
+        if float(torch.linalg.eigvalsh(covariance).min()) < -slack:
+            raise FileFormatError(path, "expected a positive semidefinite matrix", "motion.covariance")
+        return Motion(_float64(self.n), covariance)
+
+
+@dataclass(frozen=True)
+class BoardEntries(Checked):
+    """An entry of ``boards``."""
+
+    scan: Text
+    corners: PositiveInt
+    rotation: Matrix
+    translation_mm: Triple
+    rmse_before_mm: NonNegative
+    rmse_after_mm: NonNegative
+
+    def fit(self) -> BoardFit:
+        """The board's fit."""
+        return BoardFit(
+            scan=self.scan,
+            corners=self.corners,
+            rotation=_float64(self.rotation),
+            translation_mm=_float64(self.translation_mm),
+            rmse_before_mm=self.rmse_before_mm,
+            rmse_after_mm=self.rmse_after_mm,
+        )
+
+
+@dataclass(frozen=True)
+class ScanHash(Checked):
+    """An entry of ``provenance.scans``."""
+
+    path: str
+    sha256: str
+
+
+@dataclass(frozen=True)
+class ProvenanceEntries(Checked):
+    """Entry ``provenance``."""
+
+    version: str
+    config_sha256: str
+    scans: list[ScanHash]
+
+
+@dataclass(frozen=True)
+class CalibrationEntries(Checked):
+    """The entries of ``calibration.json``; the improvement follows from the two RMSE and is accepted as it is."""
+
+    format: CalibrationFormat
+    method: CalibrationMethod
+    motion: MotionEntries
+    rmse_before_mm: NonNegative
+    rmse_after_mm: NonNegative
+    iterations: tuple[Iteration, ...]
+    boards: list[BoardEntries]
+    observability: Observability
+    rig: RigEntries
+    provenance: ProvenanceEntries
+    converged: bool | None = None
+    improvement: object = None
 
 
 def write_calibration(calibration: Calibration, path: Path | str) -> None:
@@ -70,7 +155,7 @@ def write_calibration(calibration: Calibration, path: Path | str) -> None:
             "scans": [{"path": scan, "sha256": sha256} for scan, sha256 in provenance.scans],
         },
     }
-    write_text(path, json.dumps(data, indent=2, allow_nan=False, ensure_ascii=False) + "\n")
+    write_json(path, data, strict=True)
 
 
 def read_calibration(path: Path | str) -> Calibration:
@@ -80,23 +165,23 @@ def read_calibration(path: Path | str) -> Calibration:
         FileFormatError: an entry is missing, unknown, not finite or out of range.
     """
     path = Path(path)
-    fields = Fields(path, read_json(path))
-    fields.choice("format", CALIBRATION_FORMAT)
-    fields.has("improvement")  # follows from the two RMSE
-    calibration = Calibration(
-        method=cast(CalibrationMethod, fields.choice("method", *get_args(CalibrationMethod))),
-        converged=fields.flag("converged") if fields.has("converged") else True,
-        motion=_read_motion(fields.section("motion")),
-        rmse_before_mm=fields.number("rmse_before_mm", at_least=0),
-        rmse_after_mm=fields.number("rmse_after_mm", at_least=0),
-        iterations=tuple(_read_iteration(item) for item in fields.sections("iterations")),
-        boards=tuple(_read_board(item) for item in fields.sections("boards")),
-        observability=_read_observability(fields.section("observability")),
-        rig=rig_from_dict(fields.take("rig"), path, "rig."),
-        provenance=_read_provenance(fields.section("provenance")),
+    entries = read_entries(CalibrationEntries, read_json(path), path)
+    return Calibration(
+        method=entries.method,
+        converged=entries.converged is not False,
+        motion=entries.motion.motion(path),
+        rmse_before_mm=entries.rmse_before_mm,
+        rmse_after_mm=entries.rmse_after_mm,
+        iterations=entries.iterations,
+        boards=tuple(board.fit() for board in entries.boards),
+        observability=entries.observability,
+        rig=entries.rig.rig(),
+        provenance=Provenance(
+            version=entries.provenance.version,
+            config_sha256=entries.provenance.config_sha256,
+            scans=tuple((scan.path, scan.sha256) for scan in entries.provenance.scans),
+        ),
     )
-    fields.finish()
-    return calibration
 
 
 def check_rig_match(calibration: Calibration, scan: Scan) -> None:
@@ -105,7 +190,7 @@ def check_rig_match(calibration: Calibration, scan: Scan) -> None:
     Raises:
         CalibrationError: the rigs differ; names the scan and the first differing entry.
     """
-    for item in dataclass_fields(calibration.rig):
+    for item in fields(calibration.rig):
         ours, theirs = getattr(calibration.rig, item.name), getattr(scan.rig, item.name)
         if ours != theirs:
             raise CalibrationError(
@@ -124,32 +209,6 @@ def _motion_to_dict(motion: Motion) -> dict[str, object]:
     }
 
 
-def _read_motion(fields: Fields) -> Motion:
-    n = fields.tensor("n", 3)
-    if n[1] <= 0:
-        raise fields.error("n[1]", f"expected a number > 0, the travel along Y, got {float(n[1])}")
-    covariance = fields.tensor("covariance", 3, 3)
-    _check_covariance(fields, covariance)
-    for derived in ("stretch", "angles_deg", "sigma"):
-        fields.has(derived)
-    fields.finish()
-    return Motion(n, covariance)
-
-
-def _check_covariance(fields: Fields, covariance: Tensor) -> None:
-    slack = _COVARIANCE_ROUNDING * float(covariance.abs().max())
-    if float((covariance - covariance.mT).abs().max()) > slack:
-        raise fields.error("covariance", "expected a symmetric matrix")
-    if float(torch.linalg.eigvalsh(covariance).min()) < -slack:
-        raise fields.error("covariance", "expected a positive semidefinite matrix")
-
-
-def _read_iteration(fields: Fields) -> Iteration:
-    iteration = Iteration(fields.number("rmse_mm", at_least=0), _triple(fields, "n"), fields.number("stretch", above=0))
-    fields.finish()
-    return iteration
-
-
 def _board_to_dict(board: BoardFit) -> dict[str, object]:
     return {
         "scan": board.scan,
@@ -161,41 +220,5 @@ def _board_to_dict(board: BoardFit) -> dict[str, object]:
     }
 
 
-def _read_board(fields: Fields) -> BoardFit:
-    board = BoardFit(
-        scan=fields.text("scan"),
-        corners=fields.integer("corners", at_least=1),
-        rotation=fields.tensor("rotation", 3, 3),
-        translation_mm=fields.tensor("translation_mm", 3),
-        rmse_before_mm=fields.number("rmse_before_mm", at_least=0),
-        rmse_after_mm=fields.number("rmse_after_mm", at_least=0),
-    )
-    fields.finish()
-    return board
-
-
-def _read_observability(fields: Fields) -> Observability:
-    verdict = fields.choice("verdict", "determined", "prior-dominated")
-    directions = []
-    for item in fields.sections("directions"):
-        sigmas = item.number("prior_sigma", above=0), item.number("posterior_sigma", at_least=0)
-        directions.append(ObservedDirection(_triple(item, "vector"), *sigmas, item.flag("observed")))
-        item.finish()
-    advice = fields.text("advice", empty=True)
-    fields.finish()
-    return Observability(cast(Literal["determined", "prior-dominated"], verdict), tuple(directions), advice)
-
-
-def _read_provenance(fields: Fields) -> Provenance:
-    scans = []
-    for item in fields.sections("scans"):
-        scans.append((item.text("path", empty=True), item.text("sha256", empty=True)))
-        item.finish()
-    provenance = Provenance(fields.text("version", empty=True), fields.text("config_sha256", empty=True), tuple(scans))
-    fields.finish()
-    return provenance
-
-
-def _triple(fields: Fields, key: str) -> tuple[float, float, float]:
-    first, second, third = fields.tensor(key, 3).tolist()
-    return first, second, third
+def _float64(numbers: Triple | Matrix) -> Tensor:
+    return torch.tensor(numbers, dtype=torch.float64)

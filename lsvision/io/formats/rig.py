@@ -1,15 +1,66 @@
 """The rig file: ``rig.yaml``, and the same entries inside other files."""
 
+from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Literal
 
 import yaml
 
 from lsvision.io.atomic import write_text
-from lsvision.io.formats.validation import Fields, read_yaml
+from lsvision.io.formats.validation import read_entries, read_yaml
+from lsvision.schema import Checked, Positive, PositiveInt
 from lsvision.types import Rig
 
-RIG_FORMAT = "lsvision-rig/1"
-_COLORS = ("red", "green", "blue")
+RigFormat = Literal["lsvision-rig/1"]
+RIG_FORMAT: RigFormat = "lsvision-rig/1"
+
+
+@dataclass(frozen=True)
+class PrincipalPoints(Checked):
+    """Entry ``principal_point_px``: the column that each camera's optical axis meets."""
+
+    left: float
+    right: float
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.right <= self.left:  # no plane in front of the cameras has zero disparity
+            raise self.fault("right", f"expected a finite number > {self.left:g}, got {self.right}")
+
+
+@dataclass(frozen=True)
+class ColorSpacing(Checked):
+    """Entry ``color_spacing_lines``: where the sensor line of each colour looks along Y, in nominal lines."""
+
+    red: float
+    green: float
+    blue: float
+
+
+@dataclass(frozen=True)
+class RigEntries(Checked):
+    """The entries of ``rig.yaml``."""
+
+    format: RigFormat
+    width_px: PositiveInt
+    pixel_pitch_um: Positive
+    focal_length_mm: Positive
+    baseline_mm: Positive
+    principal_point_px: PrincipalPoints
+    color_spacing_lines: ColorSpacing | None = None
+
+    def rig(self) -> Rig:
+        """The rig that they describe."""
+        spacing = self.color_spacing_lines or ColorSpacing(0.0, 0.0, 0.0)
+        return Rig(
+            width_px=self.width_px,
+            pixel_pitch_um=self.pixel_pitch_um,
+            focal_length_mm=self.focal_length_mm,
+            baseline_mm=self.baseline_mm,
+            principal_left_px=self.principal_point_px.left,
+            principal_right_px=self.principal_point_px.right,
+            color_spacing_lines=(spacing.red, spacing.green, spacing.blue),
+        )
 
 
 def read_rig(path: Path | str) -> Rig:
@@ -29,51 +80,26 @@ def write_rig(rig: Rig, path: Path | str) -> None:
 
 def rig_to_dict(rig: Rig) -> dict[str, object]:
     """Plain data of a rig, as ``rig.yaml`` holds it; the colour spacing only where there is one."""
-    data: dict[str, object] = {
-        "format": RIG_FORMAT,
-        "width_px": int(rig.width_px),
-        "pixel_pitch_um": float(rig.pixel_pitch_um),
-        "focal_length_mm": float(rig.focal_length_mm),
-        "baseline_mm": float(rig.baseline_mm),
-        "principal_point_px": {"left": float(rig.principal_left_px), "right": float(rig.principal_right_px)},
-    }
-    if any(rig.color_spacing_lines):
-        data["color_spacing_lines"] = dict(zip(_COLORS, map(float, rig.color_spacing_lines), strict=True))
-    return data
+    entries = RigEntries(
+        format=RIG_FORMAT,
+        width_px=rig.width_px,
+        pixel_pitch_um=rig.pixel_pitch_um,
+        focal_length_mm=rig.focal_length_mm,
+        baseline_mm=rig.baseline_mm,
+        principal_point_px=PrincipalPoints(rig.principal_left_px, rig.principal_right_px),
+        color_spacing_lines=ColorSpacing(*rig.color_spacing_lines) if any(rig.color_spacing_lines) else None,
+    )
+    return {key: value for key, value in asdict(entries).items() if value is not None}
 
 
-def rig_from_dict(data: object, path: Path, key_prefix: str = "") -> Rig:
+def rig_from_dict(data: object, path: Path, where: str = "") -> Rig:
     """Check the plain data of a rig and make the rig.
 
     Args:
         data: what was read from ``path``.
-        key_prefix: where it stands in the file, with a dot at its end ("rig.").
+        where: key of the rig within the file ("rig"); empty for a file of its own.
 
     Raises:
         FileFormatError: an entry is missing, unknown or out of range.
     """
-    fields = Fields(path, data, key_prefix)
-    fields.choice("format", RIG_FORMAT)
-    principal = fields.section("principal_point_px")
-    left = principal.number("left")
-    rig = Rig(
-        width_px=fields.integer("width_px", at_least=1),
-        pixel_pitch_um=fields.number("pixel_pitch_um", above=0),
-        focal_length_mm=fields.number("focal_length_mm", above=0),
-        baseline_mm=fields.number("baseline_mm", above=0),
-        principal_left_px=left,
-        principal_right_px=principal.number("right", above=left),  # else no plane in front has zero disparity
-        color_spacing_lines=_color_spacing(fields),
-    )
-    principal.finish()
-    fields.finish()
-    return rig
-
-
-def _color_spacing(fields: Fields) -> tuple[float, float, float]:
-    if not fields.has("color_spacing_lines"):
-        return 0.0, 0.0, 0.0
-    spacing = fields.section("color_spacing_lines")
-    red, green, blue = (spacing.number(color) for color in _COLORS)
-    spacing.finish()
-    return red, green, blue
+    return read_entries(RigEntries, data, path, where).rig()

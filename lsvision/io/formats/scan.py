@@ -1,26 +1,94 @@
 """The scan folder: ``scan.yaml`` with its rig, images and encoder log."""
 
 from collections.abc import Iterable, Mapping
-from json import dumps
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from types import MappingProxyType
-from typing import cast
+from typing import Annotated, Literal
 
 import torch
 import yaml
 from torch import Tensor
 
+from lsvision.errors import FileFormatError
 from lsvision.io.atomic import partial_folder, write_text
 from lsvision.io.formats.encoder import read_encoder, write_encoder
 from lsvision.io.formats.rig import read_rig, write_rig
-from lsvision.io.formats.validation import Fields, read_yaml
+from lsvision.io.formats.validation import named_file, read_entries, read_yaml
 from lsvision.io.images.line_image import open_line_image
 from lsvision.io.images.tiff import write_line_image
+from lsvision.io.json_file import write_json
+from lsvision.schema import Checked, Positive, Says, Text
 from lsvision.types import DepthView, LineImage, Rig, Scan, StereoPair, Transport, Travel
 
-SCAN_FORMAT = "lsvision-scan/1"
+ScanFormat = Literal["lsvision-scan/1"]
+SCAN_FORMAT: ScanFormat = "lsvision-scan/1"
 SCAN_FILE = "scan.yaml"
-_EMPTY: Mapping = MappingProxyType({})
+# Entries that name a file or folder of the scan.
+FILE_KEYS = ("rig", "left", "right", "depth", "encoder")
+IMAGE_KEYS = ("left", "right", "depth")
+
+
+@dataclass(frozen=True)
+class ScanEntries(Checked):
+    """The entries of ``scan.yaml``."""
+
+    format: ScanFormat
+    rig: Text
+    line_pitch_mm: Positive
+    left: Text
+    right: Text | None = None
+    depth: Text | None = None
+    encoder: Text | None = None
+    transport: Transport | None = None
+    color_registered: bool | None = None
+    attributes: dict[str, Annotated[str | int | float, Says("text or a finite number")]] | None = None
+
+
+@dataclass(frozen=True)
+class NewScan:
+    """A scan to be written.
+
+    ``left``, ``right`` and ``depth`` are strips ``(lines, width, channels)`` of any height, each image taken to its end
+    before the next; exactly one of right and depth is given. Depth is float32 z, mm, one channel, NaN where there is
+    none. ``extra_json`` is plain data by file name, written beside the scan ("truth.json").
+
+    Raises:
+        ValueError: not exactly one of right and depth, or an encoder log of another length.
+    """
+
+    rig: Rig
+    travel: Travel
+    left: Iterable[Tensor]
+    right: Iterable[Tensor] | None
+    lines: int
+    depth: Iterable[Tensor] | None = None
+    channels: int = 3
+    dtype: torch.dtype = torch.uint8
+    attributes: Mapping[str, str] = field(default_factory=dict)
+    color_registered: bool = True
+    extra_json: Mapping[str, dict] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if (self.right is None) == (self.depth is None):
+            raise ValueError("right, depth: expected exactly one of them")
+        positions_mm = self.travel.positions_mm
+        if positions_mm is not None and len(positions_mm) != self.lines:
+            raise ValueError(f"travel.positions_mm: expected {self.lines} positions, got {len(positions_mm)}")
+
+    def entries(self) -> ScanEntries:
+        """What ``scan.yaml`` says; an entry at its default is None."""
+        return ScanEntries(
+            format=SCAN_FORMAT,
+            rig="rig.yaml",
+            line_pitch_mm=self.travel.line_pitch_mm,
+            left="left.tif",
+            right=None if self.right is None else "right.tif",
+            depth=None if self.depth is None else "depth.tif",
+            encoder=None if self.travel.positions_mm is None else "encoder.csv",
+            transport=None if self.travel.transport == "forward" else self.travel.transport,
+            color_registered=None if self.color_registered else False,
+            attributes={name: str(value) for name, value in self.attributes.items()} or None,
+        )
 
 
 def read_scan(path: Path | str, *, repair_encoder: bool = False) -> Scan:
@@ -35,102 +103,87 @@ def read_scan(path: Path | str, *, repair_encoder: bool = False) -> Scan:
     """
     path = Path(path)
     file = path if path.is_file() else path / SCAN_FILE
-    fields = Fields(file, read_yaml(file))
-    fields.choice("format", SCAN_FORMAT)
-    rig = read_rig(fields.file("rig"))
-    images = {key: open_line_image(fields.file(key)) for key in ("left", "right", "depth") if fields.has(key)}
-    line_pitch_mm = fields.number("line_pitch_mm", above=0)
-    encoder = fields.file("encoder") if fields.has("encoder") else None
-    transport = fields.choice("transport", "forward", "reverse") if fields.has("transport") else "forward"
-    attributes = fields.texts("attributes") if fields.has("attributes") else {}
-    color_registered = fields.flag("color_registered") if fields.has("color_registered") else True
-    fields.finish()
-    _check_images(fields, rig, images)
+    entries = read_entries(ScanEntries, read_yaml(file), file)
+    files: dict[str, Path] = {
+        key: named_file(file, key, str(name)) for key in FILE_KEYS if (name := getattr(entries, key)) is not None
+    }
+    rig = read_rig(files["rig"])
+    images = {key: open_line_image(named) for key, named in files.items() if key in IMAGE_KEYS}
+    check_images(file, rig, images)
     left = images["left"]
-    pair = StereoPair(left, images["right"]) if "right" in images else DepthView(left, images["depth"])
-    positions_mm = read_encoder(encoder, left.shape[0], repair=repair_encoder) if encoder else None
-    travel = Travel(line_pitch_mm, positions_mm, cast(Transport, transport))
-    return Scan(file.parent, rig, travel, pair, color_registered, attributes)
+    encoder = files.get("encoder")
+    return Scan(
+        path=file.parent,
+        rig=rig,
+        travel=Travel(
+            line_pitch_mm=entries.line_pitch_mm,
+            positions_mm=read_encoder(encoder, left.shape[0], repair=repair_encoder) if encoder else None,
+            transport=entries.transport or "forward",
+        ),
+        images=StereoPair(left, images["right"]) if "right" in images else DepthView(left, images["depth"]),
+        color_registered=entries.color_registered is not False,
+        attributes={name: str(value) for name, value in (entries.attributes or {}).items()},
+    )
 
 
-def write_scan(
-    folder: Path | str,
-    *,
-    rig: Rig,
-    travel: Travel,
-    left: Iterable[Tensor],
-    right: Iterable[Tensor] | None,
-    depth: Iterable[Tensor] | None = None,
-    lines: int,
-    channels: int = 3,
-    dtype: torch.dtype = torch.uint8,
-    attributes: Mapping[str, str] = _EMPTY,
-    color_registered: bool = True,
-    extra_json: Mapping[str, dict] = _EMPTY,
-) -> None:
+def scan_files(folder: Path | str) -> list[Path]:
+    """The files that make a scan, in a fixed order: ``scan.yaml``, and every file or folder that it names.
+
+    A name whose file is missing is listed as well.
+
+    Raises:
+        FileFormatError: ``scan.yaml`` cannot be read.
+    """
+    folder = Path(folder)
+    data = read_yaml(folder / SCAN_FILE)
+    entries = data if isinstance(data, Mapping) else {}
+    files = [folder / SCAN_FILE]
+    for named in (folder / str(entries[key]) for key in FILE_KEYS if entries.get(key) is not None):
+        files += sorted(file for file in named.rglob("*") if file.is_file()) if named.is_dir() else [named]
+    return files
+
+
+def write_scan(folder: Path | str, scan: NewScan) -> None:
     """Write a scan folder from strips; it appears under its name when complete.
 
     Args:
         folder: a new or empty folder, or an earlier scan to replace.
-        left, right, depth: strips ``(lines, width, channels)`` of any height, each image taken to its end before the
-            next; exactly one of right and depth. Depth is float32 z, mm, one channel, NaN where there is none.
-        extra_json: plain data by file name, written beside the scan ("truth.json").
 
     Raises:
-        ValueError: strips that do not add up to the image, or not exactly one of right and depth.
+        ValueError: strips that do not add up to the image.
         FileFormatError: ``folder`` holds something else.
     """
-    if (right is None) == (depth is None):
-        raise ValueError("right, depth: expected exactly one of them")
-    if travel.positions_mm is not None and len(travel.positions_mm) != lines:
-        raise ValueError(f"travel.positions_mm: expected {lines} positions, got {len(travel.positions_mm)}")
-    data = _scan_data(travel, attributes, color_registered, "depth" if right is None else "right")
-    shape = (lines, rig.width_px, channels)
+    shape = (scan.lines, scan.rig.width_px, scan.channels)
     with partial_folder(folder, marker=SCAN_FILE) as partial:
-        write_rig(rig, partial / "rig.yaml")
-        write_line_image(partial / "left.tif", left, shape, dtype)
-        if right is not None:
-            write_line_image(partial / "right.tif", right, shape, dtype)
-        if depth is not None:
-            write_line_image(partial / "depth.tif", depth, (lines, rig.width_px, 1), torch.float32)
-        if travel.positions_mm is not None:
-            write_encoder(travel.positions_mm, partial / "encoder.csv")
-        for name, content in extra_json.items():
-            write_text(partial / name, dumps(content, indent=2, allow_nan=False) + "\n")
-        write_text(partial / SCAN_FILE, yaml.safe_dump(data, sort_keys=False))
+        write_rig(scan.rig, partial / "rig.yaml")
+        write_line_image(partial / "left.tif", scan.left, shape, scan.dtype)
+        if scan.right is not None:
+            write_line_image(partial / "right.tif", scan.right, shape, scan.dtype)
+        if scan.depth is not None:
+            write_line_image(partial / "depth.tif", scan.depth, (scan.lines, scan.rig.width_px, 1), torch.float32)
+        if scan.travel.positions_mm is not None:
+            write_encoder(scan.travel.positions_mm, partial / "encoder.csv")
+        for name, content in scan.extra_json.items():
+            write_json(partial / name, content, strict=True)
+        entries = {key: value for key, value in asdict(scan.entries()).items() if value is not None}
+        write_text(partial / SCAN_FILE, yaml.safe_dump(entries, sort_keys=False))
 
 
-def _scan_data(travel: Travel, attributes: Mapping[str, str], color_registered: bool, second: str) -> dict[str, object]:
-    data: dict[str, object] = {
-        "format": SCAN_FORMAT,
-        "rig": "rig.yaml",
-        "line_pitch_mm": float(travel.line_pitch_mm),
-        "left": "left.tif",
-        second: f"{second}.tif",
-    }
-    if travel.positions_mm is not None:
-        data["encoder"] = "encoder.csv"
-    if travel.transport != "forward":
-        data["transport"] = travel.transport
-    if not color_registered:
-        data["color_registered"] = False
-    if attributes:
-        data["attributes"] = {name: str(value) for name, value in attributes.items()}
-    return data
+def check_images(file: Path, rig: Rig, images: Mapping[str, LineImage]) -> None:
+    """Check that the images of a scan, by key, fit each other and the rig.
 
-
-def _check_images(fields: Fields, rig: Rig, images: Mapping[str, LineImage]) -> None:
-    if "left" not in images:
-        raise fields.error("left", "missing")
+    Raises:
+        FileFormatError: they do not; names ``file`` and the key.
+    """
     if ("right" in images) == ("depth" in images):
-        raise fields.error("right", f"expected exactly one of right and depth, got {len(images) - 1}")
+        raise FileFormatError(file, f"expected exactly one of right and depth, got {len(images) - 1}", "right")
     lines = images["left"].shape[0]
     for key, image in images.items():
         if image.shape[1] != rig.width_px:
-            raise fields.error(key, f"expected {rig.width_px} columns as the rig has, got {image.shape[1]}")
+            raise FileFormatError(file, f"expected {rig.width_px} columns as the rig has, got {image.shape[1]}", key)
         if image.shape[0] != lines:
-            raise fields.error(key, f"expected {lines} lines as left has, got {image.shape[0]}")
+            raise FileFormatError(file, f"expected {lines} lines as left has, got {image.shape[0]}", key)
         if key == "depth" and (image.dtype != torch.float32 or image.shape[2] != 1):
-            raise fields.error(key, f"expected one float32 channel, got {image.shape[2]} of {image.dtype}")
+            raise FileFormatError(file, f"expected one float32 channel, got {image.shape[2]} of {image.dtype}", key)
         if key != "depth" and image.dtype not in (torch.uint8, torch.uint16):
-            raise fields.error(key, f"expected uint8 or uint16, got {image.dtype}")
+            raise FileFormatError(file, f"expected uint8 or uint16, got {image.dtype}", key)

@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from lsvision.errors import FileFormatError
-from lsvision.io.formats.validation import Fields
+from lsvision.schema import shown
 
 PRODUCT_FORMAT = "lsvision-product/1"
 FULL_LEVEL = "0"  # of an image's pyramid
@@ -87,7 +87,9 @@ def read_product(path: Path | str) -> Product:
     except Exception as error:  # damaged metadata surfaces as any of a dozen types
         raise FileFormatError(path, f"not a readable product: {error}") from error
     metadata = dict(root.attrs.get("lsvision", {}))
-    Fields(path, metadata, "lsvision.").choice("format", PRODUCT_FORMAT)
+    if metadata.get("format") != PRODUCT_FORMAT:
+        problem = f"expected {PRODUCT_FORMAT!r}, got {shown(metadata.get('format'))}"
+        raise FileFormatError(path, problem, "lsvision.format")
     rows, columns = shapes["height"]
     for name, shape in shapes.items():
         if shape != (rows, columns):

@@ -23,6 +23,7 @@ from lsvision.image.tiling import in_parallel
 from lsvision.io.atomic import partial_folder, replace_folder
 from lsvision.io.images.bands import NUMPY_DTYPES, TORCH_DTYPES
 from lsvision.io.images.tiff import ZSTD_LEVEL
+from lsvision.io.json_file import finite_or_null
 from lsvision.io.product.pyramid import halve, level_count, level_shape, multiscales
 from lsvision.io.product.reader import PRODUCT_FORMAT, image_names
 
@@ -134,7 +135,7 @@ class ProductRows:
 
 def create_product(folder: Path | str, layout: ProductLayout) -> ProductRows:
     """Lay out an empty product, all of it invalid, in a folder that takes the product's name when it is complete."""
-    attributes = {"lsvision": {**layout.metadata, "format": PRODUCT_FORMAT}}
+    attributes = {"lsvision": finite_or_null({**layout.metadata, "format": PRODUCT_FORMAT})}
     root = zarr.open_group(folder, mode="w", zarr_format=3, attributes=attributes)
     _create_image(root, layout, "color", NUMPY_DTYPES[layout.dtype], 0, layout.channels)
     _create_image(root, layout, "height", np.float32, np.nan)

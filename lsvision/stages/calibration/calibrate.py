@@ -13,7 +13,7 @@ from lsvision.estimation import Info, Posterior
 from lsvision.stages.calibration.config import CalibrationConfig
 from lsvision.stages.calibration.linearise import linearise
 from lsvision.stages.calibration.measurements import BoardMeasurements, SoundProblem
-from lsvision.stages.calibration.methods import METHODS, estimate
+from lsvision.stages.calibration.methods import estimate
 from lsvision.stages.calibration.model import rotations, squared_residuals, translations
 from lsvision.stages.calibration.observability import observe
 from lsvision.stages.calibration.problem import BoardProblem, MountingPitch
@@ -58,7 +58,7 @@ def calibrate(boards: Sequence[BoardCorners], rig: Rig, config: CalibrationConfi
     Raises:
         CalibrationError: no boards; a board with fewer than six valid corners, corners on one line, or values or
             covariances that are not finite or not positive definite (names the scan); no solution.
-        ConfigError: an option out of range.
+        ConfigError: a mounting pitch is given for more than one board.
     """
     if not boards:
         raise CalibrationError("no board scans to calibrate from")
@@ -104,7 +104,7 @@ def calibrate_batch(
         One calibration per problem; a flawed problem is flagged in ``info`` and changes no bit of the others.
 
     Raises:
-        ConfigError: an option out of range.
+        ConfigError: a mounting pitch is given for more than one board.
     """
     return _solve(BoardMeasurements(points, covariance, board_points, valid), config).summary()
 
@@ -144,11 +144,12 @@ class _Solution:
 
 def _solve(measured: BoardMeasurements, config: CalibrationConfig) -> _Solution:
     """The problems estimated, once more where their residuals ask for a larger noise."""
+    config = config.resolved()
     _check(config, measured.points.shape[-3])
     posed = SoundProblem.of(measured, _mounting_pitch(config))
     problem, start = posed.problem, posed.start
     posterior = estimate(problem, start, config)
-    drifting = config.method == "sequential" and config.process_sigma > 0  # residuals of one n are then no noise
+    drifting = config.method == "sequential" and bool(config.process_sigma)  # residuals of one n are then no noise
     scale = torch.ones_like(start[..., 0]) if drifting else _noise_scale(problem, posterior)
     if bool((scale > 1).any()):
         noisier = replace(problem, noise_chol=problem.noise_chol * scale.sqrt()[..., None, None, None, None])
@@ -158,24 +159,9 @@ def _solve(measured: BoardMeasurements, config: CalibrationConfig) -> _Solution:
 
 
 def _check(config: CalibrationConfig, boards: int) -> None:
-    """Raise ConfigError for the first option that is out of range."""
-    if config.method not in METHODS:
-        raise ConfigError(f"calibration.method must be one of {', '.join(METHODS)}, is {config.method}")
-    for name in ("prior_sigma", "rotation_sigma_rad", "translation_sigma_mm", "mounting_pitch_sigma_deg"):
-        if not getattr(config, name) > 0:
-            raise ConfigError(f"calibration.{name} must be positive, is {getattr(config, name)}")
-    for name in ("max_iterations", "two_step_max_iterations"):
-        if getattr(config, name) < 1:
-            raise ConfigError(f"calibration.{name} must be at least 1, is {getattr(config, name)}")
-    for name in ("tolerance", "two_step_threshold_mm", "process_sigma"):
-        if not getattr(config, name) >= 0:
-            raise ConfigError(f"calibration.{name} must not be negative, is {getattr(config, name)}")
-    if not math.isfinite(config.prior_sigma):
-        raise ConfigError("calibration.prior_sigma must be finite: not every board scan determines n without a prior")
+    """Raise ConfigError where an option does not fit the number of boards."""
     if config.mounting_pitch_deg is not None and boards != 1:
-        raise ConfigError(f"calibration.mounting_pitch_deg is for a single board scan, not for {boards}")
-    if config.mounting_pitch_deg is not None and config.method in ("two_step", "sequential"):
-        raise ConfigError(f"calibration.mounting_pitch_deg has no place in the method {config.method}")
+        raise ConfigError(f"calibration.mounting_pitch_deg: expected null, as there are {boards} board scans, not one")
 
 
 def _mounting_pitch(config: CalibrationConfig) -> MountingPitch | None:

@@ -84,7 +84,7 @@ def sequential(problem: BoardProblem, start: Float[Tensor, "*batch state"], conf
     the pass before: the boards' poses do not move, so that their last state is their smoothed one.
     """
     order = LineOrder.of(problem)
-    process_chol, wide = order.process_chol(config.process_sigma), _wide_chol(start, config)
+    process_chol, wide = order.process_chol(config.process_sigma or 0.0), _wide_chol(start, config)
     unit = torch.eye(3, dtype=start.dtype, device=start.device)
     mean, factor, path = start, point_factor(start), [start]
     running = torch.ones_like(start[..., 0], dtype=torch.bool)

@@ -2,9 +2,11 @@
 
 from dataclasses import dataclass
 
+from lsvision.schema import Checked, NonNegative, Positive, PositiveInt
+
 
 @dataclass(frozen=True)
-class CornersConfig:
+class CornersConfig(Checked):
     """How corners of a scan are accepted.
 
     ``max_line_difference`` (lines) rejects a corner that the two cameras place on different lines: on a rectified rig
@@ -12,6 +14,6 @@ class CornersConfig:
     the patch of a depth map to which a plane is fitted where a scan has no second image.
     """
 
-    max_line_difference: float = 1.0
-    min_corners: int = 20
-    depth_window_mm: float = 24.0
+    max_line_difference: NonNegative = 1.0
+    min_corners: PositiveInt = 20
+    depth_window_mm: Positive = 24.0

@@ -3,26 +3,29 @@
 from dataclasses import dataclass
 
 from lsvision.image.resampling import Interpolation, Resampler
+from lsvision.schema import Checked, Interval, NonNegativeInt, Positive, PositiveInt
 
 
 @dataclass(frozen=True)
-class CorrectionConfig:
+class CorrectionConfig(Checked):
     """How a scan becomes a product.
 
-    ``pitch_mm`` is the side of a product's cell; the scan's own line pitch where it is None. ``strip_rows`` are
-    computed at once. A surface counts as continuous between neighbours whose disparities differ by at most ``step_px``:
-    at one pixel it is so steep that one of the cameras no longer sees it. Holes of up to ``bridge_px`` samples are
-    bridged for colour; their height stays invalid. Depths outside ``height_range_mm`` count as not measured; the wider
-    it is, the larger the product. With ``uncertainty`` each cell also gets the standard deviation of its position;
-    ``disparity_sigma_px`` is that of the matching, where the depth comes without one.
+    The product is orthographic, with square cells, in the frame of the motion. ``pitch_mm`` is the side of a cell; the
+    scan's own line pitch where it is None. ``resampler`` ``opencv`` gives the same as ``grid_sample`` within one grey
+    value, and is faster. ``strip_rows`` are computed at once and make a chunk of the product. A surface counts as
+    continuous between neighbours whose disparities differ by at most ``step_px``: at one pixel it is so steep that one
+    of the cameras no longer sees it. Holes of up to ``bridge_px`` samples are bridged for colour; their height stays
+    invalid. Depths outside ``height_range_mm`` count as not measured; the wider it is, the larger the product. With
+    ``uncertainty`` each cell also gets the standard deviation of its position; ``disparity_sigma_px`` is that of the
+    matching, where the depth comes without one.
     """
 
-    pitch_mm: float | None = None
+    pitch_mm: Positive | None = None
     interpolation: Interpolation = "bicubic"
     resampler: Resampler = "grid_sample"
-    strip_rows: int = 512
-    step_px: float = 1.0
-    bridge_px: int = 32
-    height_range_mm: tuple[float, float] = (-60.0, 60.0)
+    strip_rows: PositiveInt = 512
+    step_px: Positive = 1.0
+    bridge_px: NonNegativeInt = 32
+    height_range_mm: Interval = (-60.0, 60.0)
     uncertainty: bool = False
-    disparity_sigma_px: float = 0.09
+    disparity_sigma_px: Positive = 0.09

@@ -4,7 +4,7 @@ import math
 
 import torch
 
-from lsvision.errors import ConfigError, FileFormatError
+from lsvision.errors import FileFormatError
 from lsvision.geometry import ProductFrame, zero_disparity_mm
 from lsvision.stages.correction.config import CorrectionConfig
 from lsvision.types import Motion, ProductGrid, Scan
@@ -14,12 +14,9 @@ def plan_product(scan: Scan, motion: Motion, config: CorrectionConfig) -> Produc
     """Grid that holds the whole field at every depth of the range, from the first line of a scan to its last.
 
     Raises:
-        ConfigError: the pitch is not positive.
         FileFormatError: the scan has only one line.
     """
     pitch = config.pitch_mm if config.pitch_mm is not None else abs(scan.travel.line_pitch_mm)
-    if not (pitch > 0 and math.isfinite(pitch)):
-        raise ConfigError(f"correction.pitch_mm must be positive, got {pitch}")
     if scan.lines < 2:
         raise FileFormatError(scan.path, f"expected at least two lines, which a surface needs, got {scan.lines}")
     frame = ProductFrame(scan.rig, scan.travel, motion.n)

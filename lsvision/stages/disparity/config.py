@@ -1,53 +1,80 @@
 """Options of the matching."""
 
+import math
 from dataclasses import dataclass, replace
 from typing import Literal
 
-from lsvision.errors import ConfigError
+from lsvision.schema import (
+    Checked,
+    Interval,
+    NonNegative,
+    NonNegativeInt,
+    OddInt,
+    OddIntFrom3,
+    Percent,
+    Positive,
+    PositiveInt,
+    PositiveOrInfinite,
+)
+
+Matcher = Literal["auto", "sgbm", "coarse_to_fine"]
 
 _COARSE_TO_FINE_PX = 1500  # from this width on a quarter of the size is enough to search in
 
 
 @dataclass(frozen=True)
-class DisparityConfig:
+class Variant:
+    """The values that a matcher gives to options that are None."""
+
+    refine_iterations: int | None  # None: those of the matcher that the width asks for
+    largest_sigma_px: float
+    halo_lines: int
+
+
+VARIANTS: dict[Matcher, Variant] = {
+    "auto": Variant(refine_iterations=None, largest_sigma_px=0.2, halo_lines=48),
+    "sgbm": Variant(refine_iterations=2, largest_sigma_px=math.inf, halo_lines=24),
+    # The search has refined once already, at half the size.
+    "coarse_to_fine": Variant(refine_iterations=1, largest_sigma_px=0.2, halo_lines=48),
+}
+
+
+@dataclass(frozen=True)
+class DisparityConfig(Checked):
     """How two images are matched.
 
     ``matcher`` is ``sgbm``, one pass over the whole range as in the paper, ``coarse_to_fine``, the whole range at a
     quarter of the size and a few disparities at half of it, or ``auto``: the latter from 1500 px a line on, below which
-    too little is left at a quarter of the size. The search range is given in heights over the plane of zero disparity,
-    mm, positive towards the cameras: -26.9..25.2 is -165..+165 px on the full 3DPIXA and the same 52 mm on any other
-    rig. ``lambda1`` and ``lambda2`` penalise a change of disparity by one and by more, per pixel of the block.
-    ``left_right_check_px`` is the largest disagreement of the two views, ``fine_check_px`` that of the finer search.
-    ``refine_iterations`` of local least squares over a window of ``refine_window`` px follow, as many as the matcher
-    needs where it is None; 0 leaves the sixteenths of a pixel of ``sgbm``, which lean towards whole ones. A pixel that
-    is then known no better than ``largest_sigma_px``, though its residual is more than noise, is dropped, and so is one
-    known five times less well.
+    a quarter of the size shows too little. An option that is None takes the value of the matcher. The search range is
+    given in heights over the plane of zero disparity, mm, positive towards the cameras: -26.9..25.2 is -165..+165 px on
+    the full 3DPIXA and the same 52 mm on any other rig. ``lambda1`` and ``lambda2`` penalise a change of disparity by
+    one and by more, per pixel of the block. ``left_right_check_px`` is the largest disagreement of the two views,
+    ``fine_check_px`` that of the finer search. Patches of disparity smaller than ``speckle_px`` are removed.
+    ``refine_iterations`` of local least squares over a window of ``refine_window`` px follow; 0 leaves the sixteenths
+    of a pixel of ``sgbm``, which lean towards whole ones. A pixel whose sigma then exceeds ``largest_sigma_px``, though
+    its residual is more than noise, is dropped, and so is any pixel whose sigma exceeds five times of it; infinity
+    keeps all.
     ``block_lines`` are matched as one, with ``halo_lines`` beyond either end that are thrown away: blocks lie at
     multiples of their size in the scan, so that a line's disparity depends on nothing else. Workers take
     ``strip_lines`` at once, rounded up to whole blocks.
     """
 
-    matcher: Literal["auto", "sgbm", "coarse_to_fine"] = "auto"
-    height_range_mm: tuple[float, float] = (-26.9, 25.2)
-    block_size: int = 5
-    lambda1: float = 8.0
-    lambda2: float = 32.0
-    left_right_check_px: int = 10
-    fine_check_px: int = 2
-    uniqueness_percent: int = 5
-    speckle_px: int = 100
-    refine_iterations: int | None = None
-    refine_window: int = 9
-    refine_noise: float = 2.0  # grey values, of 255
-    largest_sigma_px: float | None = None
-    block_lines: int = 1024
-    halo_lines: int = 48
-    strip_lines: int = 1024
-
-    def __post_init__(self) -> None:
-        for name, least in (("block_lines", 1), ("strip_lines", 1), ("halo_lines", 0)):
-            if getattr(self, name) < least:
-                raise ConfigError(f"disparity.{name}: expected at least {least}, got {getattr(self, name)}")
+    matcher: Matcher = "auto"
+    height_range_mm: Interval = (-26.9, 25.2)
+    block_size: OddInt = 5
+    lambda1: NonNegative = 8.0
+    lambda2: NonNegative = 32.0
+    left_right_check_px: NonNegativeInt = 10
+    fine_check_px: NonNegativeInt = 2
+    uniqueness_percent: Percent = 5
+    speckle_px: NonNegativeInt = 100
+    refine_iterations: NonNegativeInt | None = None
+    refine_window: OddIntFrom3 = 9
+    refine_noise: Positive = 2.0  # grey values, of 255
+    largest_sigma_px: PositiveOrInfinite | None = None
+    block_lines: PositiveInt = 1024
+    halo_lines: NonNegativeInt | None = None
+    strip_lines: PositiveInt = 1024
 
     @property
     def work_lines(self) -> int:
@@ -56,15 +83,19 @@ class DisparityConfig:
 
     @property
     def tells_sigma(self) -> bool:
-        """Whether the standard deviation of a disparity is known: refinement tells it."""
+        """Whether the standard deviation of a disparity is known: refinement gives it."""
         return self.refine_iterations != 0
 
     def for_width(self, width: int) -> "DisparityConfig":
-        """The same with what is left open settled for lines of ``width`` px."""
-        matcher = self.matcher
+        """The same for lines of ``width`` px: the matcher chosen, and its own value of every option that is None."""
+        own, matcher = VARIANTS[self.matcher], self.matcher
         if matcher == "auto":
             matcher = "coarse_to_fine" if width >= _COARSE_TO_FINE_PX else "sgbm"
-        iterations = self.refine_iterations
-        if iterations is None:
-            iterations = 1 if matcher == "coarse_to_fine" else 2  # the former has refined already, at half the size
-        return replace(self, matcher=matcher, refine_iterations=iterations)
+        iterations = own.refine_iterations if own.refine_iterations is not None else VARIANTS[matcher].refine_iterations
+        return replace(
+            self,
+            matcher=matcher,
+            refine_iterations=iterations if self.refine_iterations is None else self.refine_iterations,
+            largest_sigma_px=own.largest_sigma_px if self.largest_sigma_px is None else self.largest_sigma_px,
+            halo_lines=own.halo_lines if self.halo_lines is None else self.halo_lines,
+        )

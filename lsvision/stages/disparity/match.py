@@ -68,9 +68,10 @@ def measure_block(
         white: the largest value that pixels can have.
         index: of the block, which begins at line ``index * config.block_lines``.
     """
-    lines = HaloRange.at(index * config.block_lines, config.block_lines, config.halo_lines, left.shape[0])
+    config = config.for_width(left.shape[1])
+    lines = HaloRange.at(index * config.block_lines, config.block_lines, config.halo_lines or 0, left.shape[0])
     gray_left, gray_right = (_gray(image.read(lines.outer_start, lines.outer_stop), white) for image in (left, right))
-    match = _measure(gray_left, gray_right, rig, config.for_width(left.shape[1]))
+    match = _measure(gray_left, gray_right, rig, config)
     return StripMatch(match.disparity[lines.inner], match.sigma[lines.inner])
 
 

@@ -86,7 +86,7 @@ def assign(data: dict, key: str, value: object) -> None:
     ("key", "value", "message"),
     [
         ("format", "lsvision-calibration/2", "format: expected 'lsvision-calibration/1'"),
-        ("method", "guess", "method: expected 'joint' or"),
+        ("method", "guess", "method: expected 'joint', 'two_step',"),
         ("motion.n.1", math.nan, r"motion.n\[1\]: expected a finite number, got nan"),
         ("motion.n.0", math.inf, r"motion.n\[0\]: expected a finite number, got inf"),
         ("motion.n", [0.0, 1.0], r"motion.n: expected a list of 3, got \[0.0, 1.0\]"),

@@ -74,7 +74,8 @@ def test_before_and_after_are_the_rmse_of_the_residuals():
 def test_filters_agree_with_least_squares_far_below_a_sigma():
     boards = simulate().boards()
     joint, sequential, reference = (
-        calibrate(boards, RIG, CalibrationConfig(method=method)) for method in ("joint", "sequential", "least_squares")
+        calibrate(boards, RIG, CalibrationConfig(method=method, process_sigma=0.0))
+        for method in ("joint", "sequential", "least_squares")
     )
     for found in (joint, sequential):
         assert ((found.motion.n - reference.motion.n).abs() < 1e-3 * reference.motion.sigma).all()
@@ -158,10 +159,20 @@ def drifting(corners, process_sigma):
     return replace(corners, points=scan_position(displace(corners.points, corners.n), at_corner)), n[:, -1, -1]
 
 
+def test_sequential_lets_n_drift_unless_the_options_say_otherwise():
+    corners = simulate(THREE_TILTS[:2]).boards()
+    drifting_sigma, own_sigma, fixed_sigma = (
+        calibrate(corners, RIG, CalibrationConfig(method="sequential", process_sigma=value)).motion.sigma
+        for value in (1e-6, None, 0.0)
+    )
+    assert torch.equal(own_sigma, drifting_sigma)
+    assert (own_sigma > fixed_sigma).all()
+
+
 def test_sequential_knows_how_well_it_follows_an_n_that_drifts():
     corners, n_end = drifting(thinned(simulate(THREE_TILTS[:2], batch=(100,))), process_sigma=2e-5)
     followed = batch_of(corners, CalibrationConfig(method="sequential", process_sigma=2e-5))
-    fixed = batch_of(corners, CalibrationConfig(method="sequential"))
+    fixed = batch_of(corners, CalibrationConfig(method="sequential", process_sigma=0.0))
     low, high = mean_chi_square_band(3, 100)
     assert low < nees(followed.n - n_end, torch.linalg.cholesky(followed.covariance)).mean() < high
     assert nees(fixed.n - n_end, torch.linalg.cholesky(fixed.covariance)).mean() > 2 * high
@@ -267,13 +278,18 @@ def test_no_boards():
         ({"prior_sigma": 0.0}, "prior_sigma"),
         ({"prior_sigma": math.inf}, "prior_sigma"),
         ({"rotation_sigma_rad": -1.0}, "rotation_sigma_rad"),
-        ({"mounting_pitch_deg": 3.0}, "mounting_pitch_deg"),
         ({"mounting_pitch_deg": 3.0, "mounting_pitch_sigma_deg": 0.0}, "mounting_pitch_sigma_deg"),
         ({"method": "joynt"}, "method"),
+        ({"method": "two_step", "mounting_pitch_deg": 3.0}, "mounting_pitch_deg"),
         ({"max_iterations": 0}, "max_iterations"),
         ({"process_sigma": -1.0}, "process_sigma"),
     ],
 )
 def test_options_out_of_range_are_named(options, name):
-    with pytest.raises(ConfigError, match=rf"calibration\.{name}"):
-        calibrate(simulate(THREE_TILTS[:2]).boards(), RIG, CalibrationConfig(**options))
+    with pytest.raises(ConfigError, match=rf"CalibrationConfig\.{name}: expected"):
+        CalibrationConfig(**options)
+
+
+def test_a_mounting_pitch_is_for_one_board():
+    with pytest.raises(ConfigError, match=r"calibration\.mounting_pitch_deg: expected null"):
+        calibrate(simulate(THREE_TILTS[:2]).boards(), RIG, CalibrationConfig(mounting_pitch_deg=3.0))
