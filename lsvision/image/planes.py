@@ -1,15 +1,66 @@
 """Robust values of a noisy map at given points, by a plane fitted around each."""
 
+from dataclasses import dataclass
+
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from lsvision.types import LineImage
 
-_ROUNDS = 4  # of reweighting, each of which takes nine tenths of what outliers pull
-# A residual beyond 4.5 median deviations is three sigmas out for a normal distribution.
-_OUTLIER = 4.5
+_ROUNDS = 4  # of reweighting, each of which removes nine tenths of the outliers' pull
+_OUTLIER = 4.5  # median absolute deviations: three sigmas of a normal distribution
 _SMALLEST_SHARE = 0.25  # of the window that must lie on the plane
+
+
+@dataclass(frozen=True)
+class LocalPlanes:
+    """Value of the plane at each point, its variance from the residuals, and whether enough of the window lay on it."""
+
+    value: Float[Tensor, " points"]
+    variance: Float[Tensor, " points"]
+    valid: Bool[Tensor, " points"]
+
+
+@dataclass(frozen=True)
+class MapWindows:
+    """Windows of a map around points, one row of pixels each; values are 0 where they are not valid.
+
+    ``design`` holds (1, column, line) of each pixel, px from its point: a plane's first coefficient is its value there.
+    """
+
+    values: Float[Tensor, "points pixels"]
+    valid: Bool[Tensor, "points pixels"]
+    design: Float[Tensor, "points pixels 3"]
+
+
+@dataclass(frozen=True)
+class WeightedPlanes:
+    """Planes of weighted least squares through windows, and their normal matrices."""
+
+    coefficients: Float[Tensor, "points 3 1"]
+    normal: Float[Tensor, "points 3 3"]
+
+    @classmethod
+    def through(cls, windows: MapWindows, weight: Float[Tensor, "points pixels"]) -> "WeightedPlanes":
+        """Fit a plane to each window."""
+        # Weak enough to change nothing, strong enough that an empty window stays solvable.
+        ridge = 1e-9 * torch.eye(3, dtype=weight.dtype, device=weight.device)
+        normal = windows.design.mT @ (weight[..., None] * windows.design) + ridge
+        pull = windows.design.mT @ (weight * windows.values)[..., None]
+        return cls(torch.linalg.solve(normal, pull), normal)
+
+    def residual(self, windows: MapWindows) -> Float[Tensor, "points pixels"]:
+        """Distances of the values from the planes."""
+        return (windows.values - (windows.design @ self.coefficients)[..., 0]).abs()
+
+    def value(self) -> Float[Tensor, " points"]:
+        """The planes at their points."""
+        return self.coefficients[:, 0, 0]
+
+    def value_variance(self) -> Float[Tensor, " points"]:
+        """Variance of the value, per variance of a pixel."""
+        return torch.linalg.inv(self.normal)[:, 0, 0]
 
 
 def fit_local_planes(
@@ -17,54 +68,45 @@ def fit_local_planes(
     position: Float[Tensor, "points 2"],
     wanted: Bool[Tensor, " points"],
     half_size: tuple[int, int],
-) -> tuple[Float[Tensor, " points"], Float[Tensor, " points"], Bool[Tensor, " points"]]:
+) -> LocalPlanes:
     """Value of a one-channel map at positions (column, line), px, by least squares on a plane without its outliers.
 
     Args:
-        image: float map, NaN for none.
+        image: float map, NaN where it is invalid.
         wanted: points to evaluate; the positions of the others may be NaN.
         half_size: half the window in columns and in lines, px.
 
     Returns:
-        Value, its variance from the residuals, and whether at least a quarter of the window lay on the plane.
+        Values, valid where wanted and at least a quarter of the window lay on the plane.
     """
-    safe = torch.where(wanted[:, None], position, 0.0)
-    values, usable, offset = _gather_windows(image, safe, wanted, half_size)
-    design = torch.cat([torch.ones_like(offset[..., :1]), offset], dim=-1)
-    weight = usable.to(values.dtype)
-    for _ in range(_ROUNDS):
-        plane, _ = _weighted_plane(design, values, weight)
-        residual, spread = _residuals(design, values, plane, usable)
-        # Cauchy's weights: a cut at once would keep outliers that have drawn the plane halfway to them.
-        weight = usable / (1.0 + (residual / spread).square())
-    kept = (usable & (residual <= _OUTLIER * spread)).to(values.dtype)
-    plane, normal = _weighted_plane(design, values, kept)
-    residual, _ = _residuals(design, values, plane, usable)
+    windows = read_map_windows(image, torch.where(wanted[:, None], position, 0.0), wanted, half_size)
+    kept = _without_outliers(windows).to(windows.values.dtype)
+    planes = WeightedPlanes.through(windows, kept)
     count = kept.sum(-1)
-    variance = (kept * residual.square()).sum(-1) / (count - 3).clamp(min=1)
-    variance = variance * torch.linalg.inv(normal)[:, 0, 0]
-    return plane[:, 0, 0], variance, wanted & (count >= _SMALLEST_SHARE * design.shape[1])
+    variance = (kept * planes.residual(windows).square()).sum(-1) / (count - 3).clamp(min=1)
+    valid = wanted & (count >= _SMALLEST_SHARE * kept.shape[1])
+    return LocalPlanes(planes.value(), variance * planes.value_variance(), valid)
 
 
-def _weighted_plane(design: Tensor, values: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
-    """Planes (points, 3, 1) of least squares and their normal matrices."""
-    # Weak enough to change nothing, strong enough that an empty window stays solvable.
-    ridge = 1e-9 * torch.eye(3, dtype=values.dtype)
-    normal = design.mT @ (weight[..., None] * design) + ridge
-    return torch.linalg.solve(normal, design.mT @ (weight * values)[..., None]), normal
+def _without_outliers(windows: MapWindows) -> Tensor:
+    """Valid pixels (points, pixels) near the plane of a robust fit, by iterated reweighting."""
+    weight = windows.valid.to(windows.values.dtype)
+    for _ in range(_ROUNDS):
+        residual = WeightedPlanes.through(windows, weight).residual(windows)
+        # Rounding is not an outlier.
+        median = torch.where(windows.valid, residual, torch.nan).nanmedian(-1, keepdim=True).values + 1e-9
+        # Cauchy's weights: a cut at once would keep outliers that have drawn the plane halfway to them.
+        weight = windows.valid / (1.0 + (residual / median).square())
+    return windows.valid & (residual <= _OUTLIER * median)
 
 
-def _residuals(design: Tensor, values: Tensor, plane: Tensor, usable: Tensor) -> tuple[Tensor, Tensor]:
-    """Distances of values from planes, (points, pixels), and their median, (points, 1)."""
-    residual = (values - (design @ plane)[..., 0]).abs()
-    spread = torch.where(usable, residual, torch.nan).nanmedian(-1, keepdim=True).values
-    return residual, spread + 1e-9  # rounding is not an outlier
-
-
-def _gather_windows(
-    image: LineImage, position: Tensor, wanted: Tensor, half_size: tuple[int, int]
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Values (points, pixels) with 0 where there is none, which are usable, and the offset of each from its point."""
+def read_map_windows(
+    image: LineImage,
+    position: Float[Tensor, "points 2"],
+    wanted: Bool[Tensor, " points"],
+    half_size: tuple[int, int],
+) -> MapWindows:
+    """Windows of ``2 half + 1`` columns and lines around (column, line); only lines near wanted points are read."""
     lines, width, _ = image.shape
     half_columns, half_lines = half_size
     centre = position.round().long()
@@ -77,6 +119,7 @@ def _gather_windows(
     strip = image.read(first, last)[..., 0].to(position.dtype)
     inside = (column >= 0) & (column < width) & (line >= first) & (line < last)
     values = strip[line.clamp(first, last - 1) - first, column.clamp(0, width - 1)].flatten(1)
-    usable = inside.flatten(1) & torch.isfinite(values)
+    valid = inside.flatten(1) & torch.isfinite(values)
     offset = torch.stack([column - position[:, 0, None, None], line - position[:, 1, None, None]], dim=-1)
-    return torch.where(usable, values, 0.0), usable, offset.flatten(1, 2)
+    design = torch.cat([torch.ones_like(offset[..., :1]), offset], dim=-1).flatten(1, 2)
+    return MapWindows(torch.where(valid, values, 0.0), valid, design)

@@ -68,10 +68,10 @@ def points_in_scan(scan: Scan, depth: DepthSource, simulation: Simulation) -> Sh
 
     found, seen = _find(gray(scan.left.read(0, scan.lines)), expected, to_sheet, simulation.scene)
     depth_map = TensorImage(depth.read(0, depth.lines).z[..., None])
-    z, _, known = fit_local_planes(depth_map, found, seen, (_DEPTH_WINDOW_PX, _DEPTH_WINDOW_PX))
-    slope = slope_at(scan.rig, found[:, 0])
+    planes = fit_local_planes(depth_map, found, seen, (_DEPTH_WINDOW_PX, _DEPTH_WINDOW_PX))
+    z, slope = planes.value, slope_at(scan.rig, found[:, 0])
     measured = displace(torch.stack([slope * z, travel_at(scan.travel, found[:, 1]), z], -1), n.new_tensor([0, 1, 0]))
-    return _sheet_points(sheet, measured, found - expected, seen & known)
+    return _sheet_points(sheet, measured, found - expected, seen & planes.valid)
 
 
 def points_in_product(
@@ -91,9 +91,9 @@ def points_in_product(
         return torch.cat([q, q_z[..., None]], dim=-1) @ rotation
 
     found, seen = _find(gray(color.read(0, color.shape[0])), expected, to_sheet, simulation.scene)
-    level, _, known = fit_local_planes(height, found, seen, (_DEPTH_WINDOW_PX, _DEPTH_WINDOW_PX))
-    measured = torch.cat([found * grid.pitch_mm + origin, -level[:, None]], dim=-1)
-    return _sheet_points(sheet, measured, found - expected, seen & known)
+    planes = fit_local_planes(height, found, seen, (_DEPTH_WINDOW_PX, _DEPTH_WINDOW_PX))
+    measured = torch.cat([found * grid.pitch_mm + origin, -planes.value[:, None]], dim=-1)
+    return _sheet_points(sheet, measured, found - expected, seen & planes.valid)
 
 
 def sheet_grid(scene: SceneConfig) -> Tensor:

@@ -33,7 +33,8 @@ def measure_board(color: LineImage, height: LineImage, grid: ProductGrid, board:
     if corners is None:
         return None
     half = max(3, round(board.square_mm / grid.pitch_mm))
-    level, _, seen = fit_local_planes(height, corners.position, corners.valid, (half, half))
+    planes = fit_local_planes(height, corners.position, corners.valid, (half, half))
+    level, seen = planes.value, planes.valid
     origin = torch.tensor([grid.origin_x_mm, grid.origin_y_mm], dtype=torch.float64)
     points = torch.cat([corners.position * grid.pitch_mm + origin, -level[:, None]], dim=-1)
     neighbour, distance = distance_errors(points, board, seen)

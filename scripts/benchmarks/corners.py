@@ -11,7 +11,8 @@ import cv2
 import torch
 from torch import Tensor
 
-from lsvision.image.board.detect import detect_board, order_grid
+from lsvision.image.board.detect import detect_board
+from lsvision.image.board.order import order_grid
 from lsvision.image.brightness import gray
 from lsvision.simulation import Acquisition, MotionConfig, SceneConfig, SensorConfig, simulate
 from lsvision.types import Board, Rig, TensorImage

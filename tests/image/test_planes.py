@@ -1,4 +1,4 @@
-"""Plane fits in windows of a map: exact, robust, and silent where there is nothing."""
+"""Plane fits in windows of a map: exact, robust, and invalid where the map is."""
 
 import pytest
 import torch
@@ -30,31 +30,35 @@ def points():
 
 def test_batch_equals_loop(points):
     noisy = plane() + 0.1 * torch.randn(60, 80).double()
-    value, variance, seen = fit(noisy, points)
+    together = fit(noisy, points)
     for i in range(len(points)):
         alone = fit(noisy, points[i : i + 1])
-        torch.testing.assert_close(alone[0][0], value[i], rtol=0, atol=1e-9)
-        torch.testing.assert_close(alone[1][0], variance[i], rtol=1e-9, atol=0)
-    assert seen.all()
+        torch.testing.assert_close(alone.value[0], together.value[i], rtol=0, atol=1e-9)
+        torch.testing.assert_close(alone.variance[0], together.variance[i], rtol=1e-9, atol=0)
+    assert together.valid.all()
 
 
 def test_exact_on_a_plane(points):
-    value, variance, seen = fit(plane(), points)
-    torch.testing.assert_close(value, at(points), rtol=0, atol=1e-6)
-    assert (variance < 1e-12).all()
-    assert seen.all()
+    planes = fit(plane(), points)
+    torch.testing.assert_close(planes.value, at(points), rtol=0, atol=1e-6)
+    assert (planes.variance < 1e-12).all()
+    assert planes.valid.all()
 
 
 def test_equals_least_squares(points):
     noisy = plane() + 0.1 * torch.rand(60, 80).double()  # uniform: nothing to call an outlier
-    value, _, _ = fit(noisy, points)
+    planes = fit(noisy, points)
     for i, (u, v) in enumerate(points.tolist()):
         rows = torch.arange(round(v) - HALF[1], round(v) + HALF[1] + 1)
         columns = torch.arange(round(u) - HALF[0], round(u) + HALF[0] + 1)
         y, x = torch.meshgrid(rows.double() - v, columns.double() - u, indexing="ij")
         design = torch.stack([torch.ones_like(x), x, y], -1).reshape(-1, 3)
-        expected = torch.linalg.lstsq(design, noisy[rows][:, columns].reshape(-1, 1)).solution[0, 0]
-        torch.testing.assert_close(value[i], expected, rtol=0, atol=1e-7)
+        window = noisy[rows][:, columns].reshape(-1, 1)
+        solution = torch.linalg.lstsq(design, window).solution
+        torch.testing.assert_close(planes.value[i], solution[0, 0], rtol=0, atol=1e-7)
+        variance = (window - design @ solution).square().sum() / (len(window) - 3)
+        expected = variance * torch.linalg.inv(design.mT @ design)[0, 0]
+        torch.testing.assert_close(planes.variance[i], expected, rtol=1e-6, atol=0)
 
 
 def test_a_fifth_of_outliers_and_holes_changes_little(points):
@@ -62,27 +66,27 @@ def test_a_fifth_of_outliers_and_holes_changes_little(points):
     values = plane() + noise * torch.randn(60, 80).double()
     values[torch.rand(60, 80) < 0.2] += 30.0
     values[torch.rand(60, 80) < 0.2] = torch.nan
-    value, _, seen = fit(values, points)
-    assert seen.all()
-    assert (value - at(points)).square().mean().sqrt() < 0.03
+    planes = fit(values, points)
+    assert planes.valid.all()
+    assert (planes.value - at(points)).square().mean().sqrt() < 0.03
 
 
 def test_a_nearer_surface_at_the_side_of_the_window_is_ignored():
     values = plane() + 0.02 * torch.randn(60, 80).double()
     values[:, :36] -= 8.0  # 2 of the 13 columns of the windows about column 40
     points = torch.tensor([[40.0, 20.0], [40.3, 30.2]], dtype=torch.float64)
-    value, _, seen = fit(values, points)
-    assert seen.all()
-    torch.testing.assert_close(value, at(points), rtol=0, atol=0.02)
+    planes = fit(values, points)
+    assert planes.valid.all()
+    torch.testing.assert_close(planes.value, at(points), rtol=0, atol=0.02)
 
 
 def test_variance_predicts_the_error():
     points = torch.tensor([[40.3, 30.2]]).double().expand(300, 2)
     errors, variances = [], []
     for _ in range(200):
-        value, variance, _ = fit(plane() + 0.1 * torch.randn(60, 80).double(), points[:1])
-        errors.append(value - at(points[:1]))
-        variances.append(variance)
+        planes = fit(plane() + 0.1 * torch.randn(60, 80).double(), points[:1])
+        errors.append(planes.value - at(points[:1]))
+        variances.append(planes.variance)
     assert abs(torch.cat(errors).std() / torch.cat(variances).mean().sqrt() - 1) < 0.15
 
 
@@ -92,14 +96,14 @@ def test_empty_thin_and_unwanted_windows_are_not_seen():
     values[40, 60] = torch.nan
     points = torch.tensor([[40.0, 15.0], [40.0, 26.5], [40.0, 45.0], [torch.nan, torch.nan], [60.0, 40.0]]).double()
     wanted = torch.tensor([True, True, True, False, True])
-    value, _, seen = fit(values, points, wanted)
-    assert seen.tolist() == [False, False, True, False, True]
-    torch.testing.assert_close(value[[2, 4]], at(points[[2, 4]]), rtol=0, atol=1e-6)
-    assert not fit(values, points, torch.zeros(5, dtype=torch.bool))[2].any()
+    planes = fit(values, points, wanted)
+    assert planes.valid.tolist() == [False, False, True, False, True]
+    torch.testing.assert_close(planes.value[[2, 4]], at(points[[2, 4]]), rtol=0, atol=1e-6)
+    assert not fit(values, points, torch.zeros(5, dtype=torch.bool)).valid.any()
 
 
 def test_windows_at_the_rim_use_what_lies_within():
     points = torch.tensor([[0.0, 0.0], [79.0, 59.0]]).double()
-    value, _, seen = fit(plane(), points)
-    assert seen.all()
-    torch.testing.assert_close(value, at(points), rtol=0, atol=1e-6)
+    planes = fit(plane(), points)
+    assert planes.valid.all()
+    torch.testing.assert_close(planes.value, at(points), rtol=0, atol=1e-6)

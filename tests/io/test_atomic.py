@@ -1,9 +1,10 @@
+import errno
 from pathlib import Path
 
 import pytest
 
-from lsvision.errors import FileFormatError
-from lsvision.io.atomic import partial_file, partial_folder, write_text
+from lsvision.errors import FileFormatError, WriteError
+from lsvision.io.atomic import partial_file, partial_folder, replace_folder, write_text
 
 
 def test_file_appears_when_complete(tmp_path: Path) -> None:
@@ -71,3 +72,20 @@ def test_failed_folder_leaves_the_earlier_one(tmp_path: Path) -> None:
         break_off(partial / "half", ZeroDivisionError)
     assert [path.name for path in (tmp_path / "a").iterdir()] == ["mark"]
     assert [path.name for path in tmp_path.iterdir()] == ["a"]
+
+
+def test_replacing_puts_the_earlier_folder_back_where_the_new_one_cannot_be_moved(tmp_path: Path) -> None:
+    write_text(tmp_path / "a" / "mark", "earlier")
+    with pytest.raises(FileNotFoundError):
+        replace_folder(tmp_path / "missing", tmp_path / "a", marker="mark")
+    assert (tmp_path / "a" / "mark").read_text() == "earlier"
+    assert [path.name for path in tmp_path.iterdir()] == ["a"]
+
+
+@pytest.mark.parametrize("partial", [partial_file, lambda target: partial_folder(target, marker="mark")])
+def test_a_full_disk_names_the_target(tmp_path: Path, partial) -> None:
+    with pytest.raises(WriteError, match="a: cannot be written: No space left"), partial(tmp_path / "a"):
+        raise OSError(errno.ENOSPC, "full")
+    with pytest.raises(PermissionError), partial(tmp_path / "a"):
+        raise PermissionError(errno.EACCES, "not allowed")
+    assert not any(tmp_path.iterdir())

@@ -1,4 +1,4 @@
-"""Tall images as bands of whole lines, decoded one at a time and remembered for the next read."""
+"""Tall images as bands of whole lines, decoded one at a time and kept for the next read."""
 
 from collections import OrderedDict
 from pathlib import Path
@@ -23,7 +23,7 @@ _CACHE_BYTES = 32 * 2**20
 
 
 class Bands(Protocol):
-    """An image file seen as bands of lines, each decodable alone.
+    """An image file as bands of lines that can be decoded one by one.
 
     ``layout`` is (lines, width, channels) as stored, ``edges`` the first line of each band and the number of lines.
     """
@@ -44,7 +44,7 @@ def even_edges(lines: int, band_lines: int) -> NDArray[np.int64]:
 
 
 class BandedImage:
-    """A ``LineImage`` on bands; an alpha channel is dropped. Pickles as its path and reopens there.
+    """A ``LineImage`` on bands; an alpha channel is dropped. It is pickled as its path and opened there again.
 
     Raises:
         FileFormatError: the image is empty, or has channels or a dtype that no camera delivers.
@@ -109,7 +109,7 @@ class BandedImage:
             pixels = self._bands.decode(band)
         except (FileFormatError, MemoryError):
             raise
-        except Exception as error:  # on damaged data each codec raises a type of its own
+        except Exception as error:  # on damaged data each codec raises another type
             raise FileFormatError(self._bands.path, f"{lines} cannot be decoded: {error}") from error
         expected = (int(edges[band + 1] - edges[band]), width, channels)
         if pixels.shape != expected or pixels.dtype != self._bands.dtype:

@@ -1,12 +1,13 @@
 """A folder of equally wide frames, stacked in natural order."""
 
 import re
-import struct
 from pathlib import Path
 
 import imagecodecs
 import numpy as np
 from numpy.typing import NDArray
+from PIL.BmpImagePlugin import BmpImageFile
+from PIL.PngImagePlugin import PngImageFile
 
 from lsvision.errors import FileFormatError
 from lsvision.io.images.bands import BandedImage
@@ -14,12 +15,18 @@ from lsvision.io.images.tiff import TiffBands
 
 FRAME_SUFFIXES = (".png", ".bmp", ".tif", ".tiff")
 
+# By the first two bytes. Pillow's Image.open rejects a frame of 30 000 x 7142 px as a decompression bomb, and its limit
+# is global to the process; these classes read the header alone, of any size.
+_HEADER_READERS: dict[bytes, type[PngImageFile | BmpImageFile]] = {b"\x89P": PngImageFile, b"BM": BmpImageFile}
+
 
 class FrameBands:
-    """The frames (PNG, BMP, TIFF) of a folder, one a band; opening it decodes the first and reads headers of the rest.
+    """The frames (PNG, BMP, TIFF) of a folder, one band per frame.
+
+    Opening the folder decodes its first frame and reads the headers of all.
 
     Raises:
-        FileFormatError: no frames, or frames of different width.
+        FileFormatError: no frames, a damaged one, or frames of different width.
     """
 
     def __init__(self, path: Path) -> None:
@@ -57,14 +64,15 @@ def _frame_size(file: Path) -> tuple[int, int]:
     if file.suffix.lower() in (".tif", ".tiff"):
         return TiffBands(file).layout[:2]
     with file.open("rb") as stream:
-        header = stream.read(26)
-    if header[:8] == b"\x89PNG\r\n\x1a\n" and len(header) == 26:
-        width, lines = struct.unpack(">II", header[16:24])
-        return lines, width
-    if header[:2] == b"BM" and len(header) == 26:
-        width, lines = struct.unpack("<ii", header[18:26])
-        return abs(lines), width  # a negative height means that the top line comes first
-    raise FileFormatError(file, "expected a PNG, BMP or TIFF image")
+        reader = _HEADER_READERS.get(stream.read(2))
+        stream.seek(0)
+        if reader is None:
+            raise FileFormatError(file, "expected a PNG, BMP or TIFF image")
+        try:
+            width, lines = reader(stream).size
+        except (SyntaxError, OSError, ValueError) as error:  # a damaged header is any of these to Pillow
+            raise FileFormatError(file, f"not a readable image: {error}") from error
+    return lines, width
 
 
 def _decode_frame(file: Path) -> NDArray:

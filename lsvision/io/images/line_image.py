@@ -1,4 +1,4 @@
-"""Opening a tall image, whatever holds it."""
+"""Opening a tall image in any of the formats."""
 
 from pathlib import Path
 
@@ -15,11 +15,11 @@ _TIFF_MAGIC = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 def open_line_image(path: Path | str) -> LineImage:
     """Open a TIFF or BigTIFF, a Zarr array, or a folder of frames to be read by line ranges.
 
-    The image decodes the file's own strips, tiles, chunks or frames that a range touches, and keeps the latest, so that
-    reading onwards with an overlap decodes each about once. It holds no open file and pickles as its path.
+    A read decodes the strips, tiles, chunks or frames that the range touches. The latest are kept, so that overlapping
+    reads in order decode each about once. The image holds no open file and is pickled as its path.
 
     Raises:
-        FileFormatError: nothing there, another kind of file, or one that is damaged or cut short.
+        FileFormatError: no such file, another kind of file, or one that is damaged or cut short.
     """
     path = Path(path)
     if path.is_dir():

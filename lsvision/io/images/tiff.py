@@ -1,4 +1,4 @@
-"""TIFF and BigTIFF: read by the file's own strips and tiles, written strip by strip."""
+"""TIFF and BigTIFF: read by the strips and tiles of the file, written strip by strip."""
 
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -79,7 +79,7 @@ class TiffBands:
         self._across = -(-page.imagewidth // page.tilewidth) if page.is_tiled else 1
         band_lines = page.tilelength if page.is_tiled else min(page.rowsperstrip, page.imagelength)
         self._raw_dtype = None
-        if page.is_final:  # plain numbers in one run, often a single strip: any lines can be read
+        if page.is_final:  # uncompressed and contiguous, often a single strip: any lines can be read
             self._raw_dtype = self.dtype.newbyteorder(page.parent.byteorder)
             self._offsets, self._counts = self._offsets[:1], (page.nbytes,)
             band_lines = STRIP_LINES
@@ -95,10 +95,10 @@ class TiffBands:
             )
         if min(self._counts) == 0 or min(self._offsets) == 0:
             raise FileFormatError(self.path, "a strip or tile was never written")
-        end = max(offset + count for offset, count in zip(self._offsets, self._counts, strict=True))
+        last_byte = max(offset + count for offset, count in zip(self._offsets, self._counts, strict=True))
         size = self.path.stat().st_size
-        if end > size:
-            raise FileFormatError(self.path, f"cut short: its data reach to byte {end}, the file ends at {size}")
+        if last_byte > size:
+            raise FileFormatError(self.path, f"cut short: its data reach to byte {last_byte}, the file ends at {size}")
 
 
 def write_line_image(
@@ -109,7 +109,7 @@ def write_line_image(
     *,
     compression: Compression = "zstd",
 ) -> None:
-    """Write a BigTIFF of 256-line strips from blocks of lines of any height, one block in memory at a time.
+    """Write a BigTIFF of 256-line strips from blocks of lines of any height, with one block in memory at a time.
 
     Args:
         path: final file; it appears when complete.
@@ -119,7 +119,7 @@ def write_line_image(
         compression: "zstd" or "none".
 
     Raises:
-        ValueError: blocks that do not fit ``shape`` or ``dtype``, or do not add up to it.
+        ValueError: blocks that do not have ``dtype`` or do not add up to ``shape``.
     """
     if len(shape) != 3 or min(shape) < 1 or shape[2] not in (1, 3):
         raise ValueError(f"shape: expected (lines, width, 1 or 3), got {shape}")
@@ -140,7 +140,7 @@ def write_line_image(
             predictor=2 if delta else None,
             metadata=None,
         )
-        next(blocks, None)  # the writer stops at the last line; this finds the blocks beyond it
+        next(blocks, None)  # the writer stops at the last line; this raises where blocks go beyond it
 
 
 def _encoded(block: NDArray, compression: Compression, delta: bool) -> bytes:
@@ -151,7 +151,7 @@ def _encoded(block: NDArray, compression: Compression, delta: bool) -> bytes:
 
 
 def _blocks(strips: Iterable[Tensor], shape: tuple[int, int, int], dtype: torch.dtype) -> Iterator[NDArray]:
-    """Blocks of STRIP_LINES lines; each is valid until the next is asked for."""
+    """Blocks of STRIP_LINES lines; each is valid until the next is generated."""
     block = np.empty((STRIP_LINES, *shape[1:]), NUMPY_DTYPES[dtype])
     lines = filled = 0
     for strip in strips:

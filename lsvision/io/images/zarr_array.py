@@ -21,7 +21,7 @@ class ZarrBands:
     """The rows of chunks of a Zarr array ``(lines, width)`` or ``(lines, width, channels)``.
 
     Raises:
-        FileFormatError: a group, damaged metadata, or an array of other dimensions.
+        FileFormatError: a group, damaged metadata, or an array of another number of dimensions.
     """
 
     def __init__(self, path: Path) -> None:

@@ -14,7 +14,8 @@ from lsvision.geometry import (
     triangulate,
     triangulation_jacobian,
 )
-from lsvision.image.board.detect import DetectedCorners, detect_board
+from lsvision.image.board.detect import detect_board
+from lsvision.image.board.refine import DetectedCorners
 from lsvision.image.planes import fit_local_planes
 from lsvision.stages.corners.config import CornersConfig
 from lsvision.types import Board, BoardCorners, DepthView, LineImage, Scan, StereoPair, Travel
@@ -95,14 +96,15 @@ def _from_depth_map(scan: Scan, left: DetectedCorners, depth: LineImage, config:
     column, line = left.position.unbind(-1)
     half_columns = max(2, round(config.depth_window_mm / 2 / object_pitch_mm(scan.rig)))
     half_lines = max(2, round(config.depth_window_mm / 2 / abs(scan.travel.line_pitch_mm)))
-    z, variance, seen = fit_local_planes(depth, left.position, left.valid, (half_columns, half_lines))
+    planes = fit_local_planes(depth, left.position, left.valid, (half_columns, half_lines))
+    z = planes.value
     slope = slope_at(scan.rig, column)
     points = torch.stack([slope * z, travel_at(scan.travel, line), z], dim=-1)
     by_column_and_depth = depth_map_jacobian(scan.rig, column, z)
     by_pixel = _point_jacobian(by_column_and_depth[..., 0], _pitch_at(scan.travel, line))
     by_depth = torch.stack([slope, torch.zeros_like(z), torch.ones_like(z)], -1)[..., None]
-    covariance = by_pixel @ left.covariance @ by_pixel.mT + by_depth @ by_depth.mT * variance[:, None, None]
-    return _Measured(points, covariance, left.valid & seen)
+    covariance = by_pixel @ left.covariance @ by_pixel.mT + by_depth @ by_depth.mT * planes.variance[:, None, None]
+    return _Measured(points, covariance, left.valid & planes.valid)
 
 
 def _point_jacobian(x_z_by_column: Tensor, y_by_line: Tensor) -> Tensor:

@@ -12,7 +12,9 @@ import torch
 from torch import Tensor
 
 from lsvision.geometry import line_at, project, scan_position, transform
-from lsvision.image.board.detect import detect_board, find_grid, order_grid, reduce_image, refine_grid
+from lsvision.image.board.detect import detect_board, find_grid, reduce_image
+from lsvision.image.board.order import order_grid
+from lsvision.image.board.refine import refine_grid
 from lsvision.image.brightness import gray
 from lsvision.io import read_scan
 from lsvision.types import Board, TensorImage

@@ -7,7 +7,8 @@ import cv2
 import numpy as np
 import torch
 
-from lsvision.image.board.detect import DetectedCorners, detect_board
+from lsvision.image.board.detect import detect_board
+from lsvision.image.board.refine import DetectedCorners
 from lsvision.types import Board, TensorImage
 
 BOARD = Board(10, 7, 30.0)

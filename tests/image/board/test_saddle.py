@@ -1,11 +1,11 @@
-"""The corner fit: its derivative, its position, its covariance, and what it refuses."""
+"""The corner fit: its position, its covariance, and the windows that it rejects."""
 
 import math
 
 import pytest
 import torch
 
-from lsvision.image.board.saddle import _saddle, fit_saddles
+from lsvision.image.board.saddle import SaddleOptions, fit_saddles
 from tests.image.board.conftest import SIZE, saddle_windows
 
 
@@ -20,30 +20,6 @@ def test_batch_equals_loop(corners):
         assert alone.valid[0] == together.valid[i]
 
 
-def test_model_by_hand():
-    # Edges along the axes, blur 1, contrast 10 on 50 with slope 2 along u: at one blur right of and below the corner
-    # both edges are erf(1 / sqrt 2), the share of a normal distribution within one sigma. Right of the first edge lies
-    # another 4, more of it further down.
-    parameters = torch.tensor([[0.5, -0.25, 0.0, math.pi / 2, 1.0, 50, 2, 0, 4, 0, 1, 0, 0, 0, 10, 0, 0]]).double()
-    value, _ = _saddle(parameters, torch.tensor([[1.5, 0.5], [0.75, -0.25]]).double(), torch.ones(1, 2).double())
-    share = 0.6826894921370859
-    expected = torch.tensor([53.0 + (4 + 0.75) * share + 10 * share**2, 51.0]).double()
-    torch.testing.assert_close(value[0], expected)
-
-
-def test_jacobian_is_the_derivative(corners):
-    position, angles, blur = (tensor[:3] for tensor in corners)
-    levels = 60 * torch.randn(3, 12, dtype=torch.float64)
-    parameters = torch.cat([position, angles, blur[:, None], levels], dim=-1)
-    axis = torch.arange(-3, 4, dtype=torch.float64)
-    grid = torch.stack(torch.meshgrid(axis, axis, indexing="xy")).flatten(1)
-    weight = (torch.rand(3, 49) > 0.2).double()
-    by_autograd = torch.autograd.functional.jacobian(lambda p: _saddle(p, grid, weight)[0], parameters)
-    ours = _saddle(parameters, grid, weight)[1]
-    for i in range(3):
-        torch.testing.assert_close(ours[i].mT, by_autograd[i, :, i], rtol=0, atol=1e-9)
-
-
 def test_position_is_recovered_without_noise(corners):
     position, angles, blur = corners
     off = angles + 0.5 * (torch.rand_like(angles) - 0.5)
@@ -52,6 +28,21 @@ def test_position_is_recovered_without_noise(corners):
     assert (fit.position - position).abs().max() < 0.002
     torch.testing.assert_close(fit.blur_px, blur, rtol=0, atol=0.01)
     torch.testing.assert_close(fit.contrast, torch.full_like(blur, 90.0), rtol=0, atol=0.5)
+
+
+def test_a_plain_fit_is_near_the_full_one(corners):
+    position, angles, blur = corners
+    fit = fit_saddles(saddle_windows(position, angles, blur), angles, options=SaddleOptions(plain=True))
+    assert fit.valid.all()
+    assert (fit.position - position).abs().max() < 0.05
+
+
+def test_limits_decide_what_is_a_corner(corners):
+    position, angles, blur = corners
+    noisy = saddle_windows(position, angles, blur) + 9 * torch.randn(len(blur), SIZE, SIZE, dtype=torch.float64)
+    near = fit_saddles(noisy, angles, options=SaddleOptions(max_shift_px=1.0))
+    assert torch.equal(near.valid, torch.linalg.vector_norm(near.position, dim=-1) < 1.0)
+    assert not fit_saddles(noisy, angles, options=SaddleOptions(max_residual=0.05)).valid.any()
 
 
 def test_swapped_colours_and_scaled_brightness_change_nothing(corners):
@@ -63,7 +54,7 @@ def test_swapped_colours_and_scaled_brightness_change_nothing(corners):
         assert other.valid.all()
 
 
-def test_covariance_predicts_the_scatter():
+def test_covariance_predicts_the_error():
     count, noise = 300, 4.0
     position = torch.tensor([0.3, -0.4]).double().expand(count, 2)
     angles = torch.tensor([0.3, 0.3 + 1.9]).double().expand(count, 2)
@@ -88,10 +79,10 @@ def test_covariance_allows_for_texture(texture):
     coarse = torch.randn(count, 1, SIZE + 2, SIZE + 2, dtype=torch.float64)
     smooth = torch.nn.functional.avg_pool2d(coarse, 3, 1)[:, 0] * 3
     fit = fit_saddles(windows + noise * torch.randn_like(windows) + texture * smooth, angles)
-    scatter = fit.position.square().mean(0).sqrt()
+    error = fit.position.square().mean(0).sqrt()
     white = fit.covariance.diagonal(dim1=-2, dim2=-1).mean(0).sqrt()
     gain = fit.correlation_gain.mean().sqrt()
-    torch.testing.assert_close(gain * white, scatter, rtol=0.2, atol=0)
+    torch.testing.assert_close(gain * white, error, rtol=0.2, atol=0)
     if texture == 0:
         assert abs(gain - 1) < 0.03
     else:

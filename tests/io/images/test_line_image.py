@@ -1,4 +1,6 @@
 import pickle
+import struct
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 
@@ -224,6 +226,40 @@ def test_damaged_strip_names_its_lines(tmp_path: Path) -> None:
     image.read(0, 64)
     with pytest.raises(FileFormatError, match="lines 64-127 cannot be decoded"):
         image.read(60, 70)
+
+
+@pytest.mark.parametrize(("suffix", "kept"), [("png", 20), ("png", 30), ("bmp", 10), ("bmp", 20)])
+def test_frame_with_a_damaged_header(tmp_path: Path, suffix: str, kept: int) -> None:
+    encode = {"png": imagecodecs.png_encode, "bmp": imagecodecs.bmp_encode}[suffix]
+    (tmp_path / f"1.{suffix}").write_bytes(encode(COLOR))
+    (tmp_path / f"2.{suffix}").write_bytes(encode(COLOR)[:kept])
+    with pytest.raises(FileFormatError, match=rf"2\.{suffix}: not a readable image: [^\n]*$"):
+        open_line_image(tmp_path)
+
+
+def png_header(lines: int, width: int) -> bytes:
+    """The start of a PNG of bytes, up to its first pixels."""
+    parts = []
+    for kind, data in ((b"IHDR", struct.pack(">IIBBBBB", width, lines, 8, 0, 0, 0, 0)), (b"IDAT", b"")):
+        parts.append(struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data)))
+    return b"\x89PNG\r\n\x1a\n" + b"".join(parts)
+
+
+def test_frames_of_any_size(tmp_path: Path) -> None:
+    # Pillow's Image.open calls more than 179 million pixels an attack; a warning would fail the test as well.
+    (tmp_path / "1.png").write_bytes(imagecodecs.png_encode(np.zeros((10, 7142), np.uint8)))
+    (tmp_path / "2.png").write_bytes(png_header(30_000, 7142))
+    image = open_line_image(tmp_path)
+    assert image.shape == (30_010, 7142, 1)
+    with pytest.raises(FileFormatError, match=r"2\.png: cannot be decoded"):
+        image.read(10, 11)
+
+
+def test_bmp_with_the_top_line_first(tmp_path: Path) -> None:
+    data = bytearray(imagecodecs.bmp_encode(COLOR))
+    data[22:26] = struct.pack("<i", -300)
+    (tmp_path / "1.bmp").write_bytes(data)
+    assert open_line_image(tmp_path).shape == (300, 48, 3)
 
 
 def test_damaged_frame(tmp_path: Path) -> None:

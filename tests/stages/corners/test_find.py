@@ -8,7 +8,7 @@ import torch
 
 from lsvision.errors import BoardNotFoundError
 from lsvision.geometry import triangulate
-from lsvision.image.board.detect import DetectedCorners
+from lsvision.image.board.refine import DetectedCorners
 from lsvision.simulation import EncoderConfig
 from lsvision.stages.corners.config import CornersConfig
 from lsvision.stages.corners.find import _triangulated, find_corners

@@ -1,0 +1,123 @@
+"""Corners of a board to a fraction of a pixel, from a grid that is good to about two pixels."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from lsvision.image.board.saddle import SaddleFit, SaddleOptions, fit_saddles
+from lsvision.image.brightness import gray
+from lsvision.types import LineImage
+
+_READ_LINES = 512
+_INTO_SQUARES = 0.4  # share of a square that a window takes in: blur and shift stay clear of the next edges
+_FEWEST_PIXELS = 49  # of the squares in a window
+# How far the fit of a window may be from the board's median: a corner under glare, smear or dirt is another picture.
+_WORST_RESIDUAL, _WORST_BLUR, _LEAST_CONTRAST = 3.0, 2.0, 0.3
+
+
+@dataclass(frozen=True)
+class DetectedCorners:
+    """Corners of one board in one image, in the board's order: (column, line) px, covariance px², valid or not."""
+
+    position: Float[Tensor, "corners 2"]
+    covariance: Float[Tensor, "corners 2 2"]
+    valid: Bool[Tensor, " corners"]
+
+
+@dataclass(frozen=True)
+class GridSteps:
+    """Steps from each corner of a grid to its neighbours along X and along Y, px."""
+
+    along_x: Float[Tensor, "corners 2"]
+    along_y: Float[Tensor, "corners 2"]
+
+    @classmethod
+    def of(cls, grid: Float[Tensor, "rows columns 2"]) -> "GridSteps":
+        """Central differences, one-sided at the rim."""
+        along_y, along_x = torch.gradient(grid, dim=(0, 1))
+        return cls(along_x.reshape(-1, 2), along_y.reshape(-1, 2))
+
+    def window_radius(self, largest: int) -> int:
+        """Half the size of windows that reach into the four squares around their corners, px."""
+        extent = _INTO_SQUARES * (self.along_x.abs() + self.along_y.abs()).amax()
+        return int(extent.ceil().clamp(3, largest))
+
+    def normal_angles(self) -> Float[Tensor, "corners 2"]:
+        """Direction of the normals of the edges along X and along Y, rad: a quarter turn from the edges."""
+        return torch.stack([torch.atan2(d[:, 1], d[:, 0]) + torch.pi / 2 for d in (self.along_x, self.along_y)], dim=-1)
+
+    def within_squares(self, radius: int) -> Bool[Tensor, "corners size size"]:
+        """Pixels of windows that lie well within the four squares around their corners."""
+        steps = torch.stack([self.along_x, self.along_y], dim=-1)
+        span = torch.arange(-radius, radius + 1, dtype=steps.dtype)
+        offset = torch.stack(torch.meshgrid(span, span, indexing="xy")).flatten(1)
+        share = torch.linalg.solve(steps, offset.expand(len(steps), 2, -1))
+        mask = (share.abs() < _INTO_SQUARES).all(1).unflatten(-1, (len(span), len(span)))
+        # Corners closer than four pixels leave too few pixels for a fit: then the whole window is used.
+        return mask | (mask.sum((1, 2)) < _FEWEST_PIXELS)[:, None, None]
+
+
+def refine_grid(
+    image: LineImage, grid: Float[Tensor, "rows columns 2"], *, largest_radius: int = 13, plain: bool = False
+) -> DetectedCorners:
+    """Locate corners at full size, from a grid good to about two pixels: one batch of windows, fitted together.
+
+    A window reaches into the four squares around its corner, at any angle, shear and stretch, and at most
+    ``largest_radius`` px: past it the board's texture weighs more than what is gained. A ``plain`` fit is good to a few
+    hundredths of a pixel.
+    """
+    steps = GridSteps.of(grid)
+    radius = steps.window_radius(largest_radius)
+    centre = grid.reshape(-1, 2).round().long()
+    inside = lies_within(image, centre, radius)
+    windows = read_windows(image, centre, inside, radius)
+    fit = fit_saddles(
+        windows, steps.normal_angles().to(windows), steps.within_squares(radius), SaddleOptions(plain=plain)
+    )
+    valid = _like_the_board(fit, fit.valid & inside)
+    # The surface's texture is the same all over the board, and the gain of one window is a rough figure.
+    covariance = fit.correlation_gain[valid].mean() * fit.covariance
+    return DetectedCorners(
+        torch.where(valid[:, None], centre + fit.position, torch.nan),
+        torch.where(valid[:, None, None], covariance, torch.nan),
+        valid,
+    )
+
+
+def lies_within(image: LineImage, centre: Int[Tensor, "corners 2"], radius: int) -> Bool[Tensor, " corners"]:
+    """Whether the square windows around (column, line) lie within an image."""
+    lines, width, _ = image.shape
+    return ((centre >= radius) & (centre < torch.tensor([width, lines]) - radius)).all(-1)
+
+
+def read_windows(
+    image: LineImage, centre: Int[Tensor, "corners 2"], wanted: Bool[Tensor, " corners"], radius: int
+) -> Float[Tensor, "corners size size"]:
+    """Brightness in square windows around (column, line), float64; 0 where a window is not wanted."""
+    size = 2 * radius + 1
+    windows = torch.zeros(centre.shape[0], size, size, dtype=torch.float64)
+    span = torch.arange(size) - radius
+    first = centre[:, 1] - radius
+    for start in range(0, image.shape[0], _READ_LINES):
+        here = wanted & (first >= start) & (first < start + _READ_LINES)
+        if not bool(here.any()):
+            continue
+        strip = image.read(start, min(image.shape[0], start + _READ_LINES + size))
+        rows = (centre[here, 1, None] + span - start)[:, :, None]
+        columns = (centre[here, 0, None] + span)[:, None, :]
+        windows[here] = gray(strip[rows, columns]).to(torch.float64)
+    return windows
+
+
+def _like_the_board(fit: SaddleFit, valid: Tensor) -> Tensor:
+    """Valid corners whose windows look like those of the rest of the board: smear, glare and dirt do not."""
+    relative = fit.residual / fit.contrast
+    valid = valid & (relative < _WORST_RESIDUAL * _median(relative, valid))
+    valid = valid & (fit.blur_px < _WORST_BLUR * _median(fit.blur_px, valid))
+    return valid & (fit.contrast > _LEAST_CONTRAST * _median(fit.contrast, valid))
+
+
+def _median(values: Tensor, valid: Tensor) -> Tensor:
+    return torch.where(valid, values, torch.nan).nanmedian()

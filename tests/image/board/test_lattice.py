@@ -1,0 +1,99 @@
+"""Boards from saddles: the strongest saddles, the lattice through them, and the board on the lattice."""
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+from lsvision.image.board.lattice import QuadraticMap, board_on_lattice, grow_lattice
+from lsvision.image.board.saddle_points import SaddlePoints, find_saddle_points
+
+INNER = (5, 4)
+
+
+def bent(node: Tensor) -> Tensor:
+    """Places of lattice nodes: turned, sheared, slightly curved."""
+    x, y = node.double().unbind(-1)
+    return torch.stack([200 + 14 * x - 6 * y + 0.1 * x * y, 150 + 5 * x + 11 * y + 0.05 * x * x], dim=-1)
+
+
+@pytest.fixture
+def nodes() -> Tensor:
+    y, x = torch.meshgrid(torch.arange(INNER[1]), torch.arange(INNER[0]), indexing="ij")
+    return torch.stack([x, y], dim=-1).reshape(-1, 2)
+
+
+def saddles_at(nodes: Tensor) -> SaddlePoints:
+    """Saddles on nodes, bright and dark swapped from one to the next."""
+    sign = 1.0 - 2.0 * (nodes.sum(-1) % 2)
+    curvature = sign[:, None] * torch.tensor([0.0, math.sqrt(0.5), 0.0])
+    return SaddlePoints(bent(nodes), curvature.double(), torch.ones(len(nodes)).double())
+
+
+def test_saddle_points_are_those_of_a_chequered_wave():
+    v, u = torch.meshgrid(torch.arange(80.0), torch.arange(100.0), indexing="ij")
+    wave = 100 + 50 * torch.sin(math.pi * u / 20) * torch.sin(math.pi * v / 20)
+    saddles = find_saddle_points(wave, most=100, expected=12)
+    inside = {(float(u), float(v)) for u in range(20, 100, 20) for v in range(20, 80, 20)}
+    found = {tuple(point) for point in saddles.points.tolist()}
+    assert inside <= found
+    # The colours alternate from one to the next along either axis.
+    first = saddles.points.tolist().index([20.0, 20.0])
+    alignment = dict(zip(map(tuple, saddles.points.tolist()), saddles.alignment(first).tolist(), strict=True))
+    assert alignment[40.0, 40.0] == pytest.approx(1.0, abs=0.01)
+    assert alignment[40.0, 20.0] == pytest.approx(-1.0, abs=0.01)
+    assert alignment[20.0, 40.0] == pytest.approx(-1.0, abs=0.01)
+
+
+def test_fewer_points_are_the_strongest():
+    brightness = torch.rand(60, 60)
+    many, few = (find_saddle_points(brightness, most, expected=20) for most in (40, 10))
+    assert len(few.points) == 10
+    assert torch.equal(few.points, many.points[:10])
+
+
+def test_quadratic_map_is_recovered():
+    position = torch.randn(20, 2).double()
+    truth = QuadraticMap(torch.randn(6, 2).double())
+    torch.testing.assert_close(QuadraticMap.fitted(position, truth(position)).coefficients, truth.coefficients)
+    x, y = position[0].tolist()
+    by_hand = sum(c * p for c, p in zip(truth.coefficients[:, 0].tolist(), (1, x, y, x * x, x * y, y * y), strict=True))
+    assert float(truth(position)[0, 0]) == pytest.approx(by_hand)
+    matrix = torch.tensor([[1.0, 2.0], [3.0, 4.0]]).double()
+    torch.testing.assert_close(QuadraticMap.linear(matrix)(position), position @ matrix.mT)
+
+
+def test_a_lattice_grows_over_the_board_and_leaves_strays_out(nodes):
+    board = saddles_at(nodes)
+    stray = SaddlePoints(bent(torch.tensor([[3.4, 0.5], [0.4, 2.6]])), board.curvature[:2], board.evenness[:2])
+    parts = ("points", "curvature", "evenness")
+    saddles = SaddlePoints(*(torch.cat([getattr(board, name), getattr(stray, name)]) for name in parts))
+    for seed in (0, 7, 19):
+        lattice = grow_lattice(saddles, seed)
+        assert lattice.on_grid.tolist() == [True] * 20 + [False] * 2
+        # Which neighbours of the seed are taken decides the axes and their directions, not the distances.
+        steps = (lattice.node[:20] - lattice.node[seed]).abs().sum(-1)
+        assert torch.equal(steps, (nodes - nodes[seed]).abs().sum(-1).double())
+
+
+def test_saddles_on_one_line_are_no_lattice(nodes):
+    assert grow_lattice(saddles_at(nodes[:5]), 0) is None
+    assert grow_lattice(saddles_at(nodes[:1]), 0) is None
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_missing_corners_lie_where_the_grid_continues(nodes, turned):
+    kept = torch.ones(20, dtype=torch.bool)
+    kept[[0, 7, 13, 19]] = False
+    node = nodes.flip(-1) if turned else nodes
+    grid = board_on_lattice(bent(nodes)[kept], node[kept].double() - 3, INNER)
+    assert grid.shape == (INNER[1], INNER[0], 2)
+    assert torch.equal(grid.reshape(-1, 2)[kept], bent(nodes)[kept])
+    torch.testing.assert_close(grid.reshape(-1, 2), bent(nodes), rtol=0, atol=1e-9)
+
+
+def test_too_few_corners_or_too_many_strays_are_no_board(nodes):
+    assert board_on_lattice(bent(nodes)[:9], nodes[:9].double(), INNER) is None
+    strays = torch.cat([nodes, nodes[:3] + 40])
+    assert board_on_lattice(bent(strays), strays.double(), INNER) is None
