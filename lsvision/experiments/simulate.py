@@ -31,11 +31,10 @@ log = logging.getLogger(__name__)
 class SimulateSettings(RunSettings):
     """Options of the experiment.
 
-    ``scale`` = 4 means a quarter of the pixels at four times the pitch, 1 the full camera, whose line pitch is
-    ``line_pitch_mm``. ``lines`` is as many as the target needs where
-    it is None. ``output`` is the scan folder to write, ``scan`` in the run's folder where it is None. With ``depth``
-    the scan has the true depth map of the left image in place of the right image, as a camera with a matcher of its
-    own writes.
+    ``scale`` = 1 is the full camera with the line pitch ``line_pitch_mm``; 4 means a quarter of the pixels at four
+    times the pitch. If ``lines`` is None, the scan shows the whole target. ``output`` is the scan folder to write,
+    ``scan`` in the run's folder if it is None. With ``depth`` the scan has the true depth map of the left image in
+    place of the right image, like the scans of a camera that computes depth maps.
     """
 
     rig: Rig

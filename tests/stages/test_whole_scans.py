@@ -91,7 +91,7 @@ def test_coarser_cells_show_no_false_pattern():
     scan = rough_scan(Travel(PITCH))
     stripes = ((torch.arange(700) % 2) * 200).to(torch.uint8).expand(LINES, 700)[..., None].expand(-1, -1, 3)
     flat = torch.full((LINES, 700, 1), 796.9)
-    scan = dataclasses.replace(scan, left=TensorImage(stripes), depth=TensorImage(flat))
+    scan = dataclasses.replace(scan, images=DepthView(TensorImage(stripes), TensorImage(flat)))
     coarse = product(scan, dataclasses.replace(CONFIG, pitch_mm=3.1 * PITCH), motion_of(0.0, 1.0, 0.0))
     inner = coarse["color"][20:-20, 40:-40][coarse["valid"][20:-20, 40:-40]].float()
     assert (inner - 100).abs().max() <= 3
