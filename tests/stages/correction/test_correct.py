@@ -10,17 +10,22 @@ from torch import Tensor
 from lsvision.errors import ConfigError
 from lsvision.geometry import line_at, product_axes, to_product, travel_at
 from lsvision.image.tiling import PIXEL_PARTS
+from lsvision.simulation import MotionConfig, SceneConfig, SensorConfig, simulate
 from lsvision.stages.correction.config import CorrectionConfig
 from lsvision.stages.correction.correct import Correction, correct_scan
 from lsvision.stages.correction.grid import plan_product
 from lsvision.stages.disparity.depth import depth_of
 from lsvision.types import DepthView, Motion, Rig, Scan, TensorImage, Travel
-from tests.stages.rendered import PITCH, SMALL_RIG
+from tests.stages.rendered import BOARD, PITCH, SMALL_RIG, depth_scan
 
 LINES = 150
 DEPTH = 790.0
 RIG = dataclasses.replace(SMALL_RIG, width_px=200)
 CONFIG = CorrectionConfig(height_range_mm=(-30.0, 30.0))
+ONE_STRIP = dataclasses.replace(CONFIG, strip_rows=10_000)
+FLAWLESS_RAIL = SceneConfig(
+    kind="rail", rail_rise_mm=22.0, conveyor_drop_mm=26.0, defect_spacing_mm=0.0, roll_mark_period_mm=0.0
+)
 LOG = (torch.arange(LINES) * PITCH + 0.5 * torch.sin(torch.arange(LINES) / 9.0)).double()
 MOTIONS = {
     "nominal": ((0.0, 1.0, 0.0), Travel(PITCH)),
@@ -263,3 +268,15 @@ def test_an_overview_of_many_lines_a_cell_is_the_same_in_any_strips(resampler):
     assert len(made[0]) > 500
     assert torch.equal(*made)
     assert (made[0] > 0).any()
+
+
+@pytest.mark.parametrize("angles", [(0.0, 0.0), (2.0, 1.5), (-3.0, 3.0), (3.0, -3.0)])
+def test_heights_count_from_the_middle_of_zero_disparity(angles):
+    """A rail 22 mm before that point reads 22.00, the conveyor 26 mm behind it -26.00, at any skew of the motion."""
+    motion = MotionConfig(angle_x_deg=angles[0], angle_z_deg=angles[1], stretch=1.0246)
+    source = simulate(SMALL_RIG, BOARD, FLAWLESS_RAIL, motion, SensorConfig(supersampling=1), PITCH, lines=120)
+    scan = depth_scan(source)
+    (strip,) = correct_scan(scan, depth_of(scan), Motion(source.trajectory.n, torch.zeros(3, 3).double()), ONE_STRIP)
+    heights = strip.height[strip.valid]
+    assert heights.max() == pytest.approx(FLAWLESS_RAIL.rail_rise_mm, abs=0.005)
+    assert heights.median() == pytest.approx(-FLAWLESS_RAIL.conveyor_drop_mm, abs=0.005)
