@@ -42,21 +42,6 @@ class Rig(Checked):
         if right <= left:  # no plane in front of the cameras has zero disparity
             raise self.fault("principal_right_px", f"expected a finite number > {left:g}, got {right}")
 
-    @property
-    def focal_length_px(self) -> float:
-        """Focal length over pixel pitch."""
-        return self.focal_length_mm / (self.pixel_pitch_um * 1e-3)
-
-    @property
-    def zero_disparity_mm(self) -> float:
-        """Depth z0 of the plane that both cameras see in the same column; the zero of heights."""
-        return self.focal_length_px * self.baseline_mm / (self.principal_right_px - self.principal_left_px)
-
-    @property
-    def object_pitch_mm(self) -> float:
-        """Distance of neighbouring pixels on the object, at the plane of zero disparity."""
-        return self.zero_disparity_mm / self.focal_length_px
-
 
 @dataclass(frozen=True)
 class Board(Checked):
@@ -271,12 +256,11 @@ class Iteration:
 
 @dataclass(frozen=True)
 class BoardFit:
-    """Pose of one board, ``p_scan = R p_board + T``, and its residuals before and after calibration."""
+    """Pose of one board in the scan frame, and its residuals before and after calibration."""
 
     scan: str
     corners: int
-    rotation: Float[Tensor, "3 3"]
-    translation_mm: Float[Tensor, "3"]
+    pose: Pose
     rmse_before_mm: float
     rmse_after_mm: float
 

@@ -163,5 +163,5 @@ def observability_bars(calibration: Calibration, *, name: str = "observability",
 def corners_in_board_frame(corners: BoardCorners, n: Tensor) -> Tensor:
     """Measured corners, mm, in the board's frame under a motion n, at the pose that fits them best."""
     points = displace(corners.points, n)
-    rotation, translation = fit_rigid(corners.board_points, points, corners.valid)
-    return (points - translation) @ rotation
+    pose = fit_rigid(corners.board_points, points, corners.valid)
+    return (points - pose.translation) @ pose.rotation

@@ -23,7 +23,7 @@ def corners_in_space(boards: Sequence[BoardCorners], calibration: Calibration) -
         color = COLORS[index % len(COLORS)]
         measured = displace(board.points[board.valid], calibration.motion.n).numpy()
         axes.scatter(*_upright(measured).T, s=9, color=color, depthshade=False, label=Path(board.scan).name)
-        fitted = transform(fit.rotation, fit.translation_mm, board.board_points).numpy()
+        fitted = transform(fit.pose.rotation, fit.pose.translation, board.board_points).numpy()
         axes.plot_trisurf(*_upright(fitted).T, color=color, alpha=0.25, linewidth=0)
     label_space(axes, "Corners and fitted boards", "X across [mm]", "Y along [mm]", "towards the cameras, -Z [mm]")
     figure.legend(loc="outside lower center", ncols=4, fontsize=8)

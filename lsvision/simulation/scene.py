@@ -21,7 +21,7 @@ def place(rig: Rig, board: Board, scene: SceneConfig, n: Tensor, middle_mm: floa
     middle = middle_point(rig) + n.new_tensor([0.0, 0.0, scene.depth_offset_mm]) + middle_mm * n
     if scene.kind == "rail":
         rotation = aligned_rotation(n) @ _turn(0.0, scene.roll_deg, 0.0)
-        return Pose(rotation, middle - n.new_tensor([0.0, 0.0, scene.rail_rise_mm]))
+        return Pose(rotation, middle - scene.rail_rise_mm * _height_axis(n))
     rotation = _turn(scene.pitch_deg, scene.roll_deg, scene.yaw_deg)
     outline = _outline(board, scene)
     center = torch.cat([outline.mean(0), outline.new_zeros(1)])
@@ -40,13 +40,18 @@ def scene_lines(board: Board, scene: SceneConfig, n: Tensor, line_pitch_mm: floa
 def build_scene(rig: Rig, board: Board, scene: SceneConfig, pose: Pose, n: Tensor) -> Scene:
     """Target, conveyor and lights; conveyor and rail run along the motion n."""
     lighting = line_lights(rig)
-    ground = middle_point(rig) + n.new_tensor([0.0, 0.0, scene.conveyor_drop_mm])
+    ground = middle_point(rig) + scene.conveyor_drop_mm * _height_axis(n)
     conveyor = Conveyor(Pose(aligned_rotation(n), ground), lighting, scene.texture_mm, scene.seed)
     if scene.kind == "board":
         return BoardScene(board, scene, pose, lighting, conveyor)
     if scene.kind == "sheet":
         return SheetScene(scene, pose, lighting, conveyor)
     return RailScene(scene, pose, lighting, conveyor)
+
+
+def _height_axis(n: Tensor) -> Tensor:
+    """e_z of the product frame, along which rise and drop are measured as heights are, away from the cameras."""
+    return aligned_rotation(n)[:, 2]
 
 
 def _outline(board: Board, scene: SceneConfig) -> Tensor:

@@ -105,8 +105,8 @@ def sheet_grid(scene: SceneConfig) -> Tensor:
 
 
 def _sheet_points(sheet: Tensor, measured: Tensor, shift: Tensor, valid: Tensor) -> SheetPoints:
-    rotation, translation = fit_rigid(sheet[valid], measured[valid])
-    in_sheet = (measured[valid] - translation) @ rotation
+    pose = fit_rigid(sheet[valid], measured[valid])
+    in_sheet = (measured[valid] - pose.translation) @ pose.rotation
     return SheetPoints(sheet[valid], in_sheet, torch.linalg.vector_norm(shift[valid], dim=-1))
 
 

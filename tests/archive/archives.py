@@ -20,6 +20,7 @@ from lsvision.archive import (
     run_jobs,
     scan_job,
 )
+from lsvision.geometry import zero_disparity_mm
 from lsvision.io import NewScan, read_product, write_calibration, write_scan
 from lsvision.stages.correction.config import CorrectionConfig
 from lsvision.stages.disparity.config import DisparityConfig
@@ -39,7 +40,7 @@ def make_scan(folder: Path, lines: int = 96, seed: int = 0, *, stereo: bool = Fa
     """A scan of random colours: with a depth map, or a right image that the left one is a shifted copy of."""
     random = torch.Generator().manual_seed(seed)
     left = torch.randint(1, 256, (lines, WIDTH, 3), generator=random).to(torch.uint8)
-    depth = RIG.zero_disparity_mm + 5.0 * torch.rand(lines, WIDTH, 1, generator=random)
+    depth = zero_disparity_mm(RIG) + 5.0 * torch.rand(lines, WIDTH, 1, generator=random)
     write_scan(
         folder,
         NewScan(

@@ -33,7 +33,8 @@ def test_batch_equals_loop() -> None:
     rotations = rotation_from_vector(vectors)
     points = torch.randn(2, 3, 5, 3, dtype=torch.float64)
     moved = transform(rotations, vectors, points)
-    fitted_rotation, fitted_translation = fit_rigid(points, moved)
+    pose = fit_rigid(points, moved)
+    fitted_rotation, fitted_translation = pose.rotation, pose.translation
     for i in range(2):
         for j in range(3):
             for function, argument in (
@@ -45,7 +46,8 @@ def test_batch_equals_loop() -> None:
                 torch.testing.assert_close(function(argument)[i, j], function(argument[i, j]), rtol=1e-14, atol=1e-15)
             single = transform(rotations[i, j], vectors[i, j], points[i, j])
             torch.testing.assert_close(moved[i, j], single, rtol=1e-14, atol=1e-14)
-            rotation, translation = fit_rigid(points[i, j], single)
+            pose = fit_rigid(points[i, j], single)
+            rotation, translation = pose.rotation, pose.translation
             torch.testing.assert_close(fitted_rotation[i, j], rotation, rtol=0, atol=1e-13)
             torch.testing.assert_close(fitted_translation[i, j], translation, rtol=0, atol=1e-13)
 
@@ -128,28 +130,29 @@ def test_fit_recovers_the_motion() -> None:
     rotation, translation = rotation_from_vector(unit(4) * 2), torch.randn(4, 3, dtype=torch.float64) * 500
     source = torch.randn(20, 3, dtype=torch.float64) * 100
     fitted = fit_rigid(source, transform(rotation, translation, source.expand(4, 20, 3)))
-    torch.testing.assert_close(fitted[0], rotation, rtol=0, atol=1e-13)
-    torch.testing.assert_close(fitted[1], translation, rtol=0, atol=1e-11)
+    torch.testing.assert_close(fitted.rotation, rotation, rtol=0, atol=1e-13)
+    torch.testing.assert_close(fitted.translation, translation, rtol=0, atol=1e-11)
 
 
 def test_fit_of_a_plane_is_a_proper_rotation() -> None:
     board = torch.cat([torch.randn(30, 2, dtype=torch.float64) * 100, torch.zeros(30, 1).double()], -1)
     rotation = rotation_from_vector(unit() * 0.2)
     noisy = transform(rotation, torch.zeros(3).double(), board) + 1e-3 * torch.randn(30, 3, dtype=torch.float64)
-    fitted, _ = fit_rigid(board, noisy)
+    fitted = fit_rigid(board, noisy).rotation
     assert float(torch.linalg.det(fitted)) == pytest.approx(1.0)
     torch.testing.assert_close(fitted, rotation, rtol=0, atol=1e-4)
 
 
 def test_fit_of_a_mirrored_cloud_is_a_proper_rotation() -> None:
     source = torch.randn(30, 3, dtype=torch.float64)
-    fitted, _ = fit_rigid(source, source * torch.tensor([1.0, 1.0, -1.0], dtype=torch.float64))
+    fitted = fit_rigid(source, source * torch.tensor([1.0, 1.0, -1.0], dtype=torch.float64)).rotation
     assert float(torch.linalg.det(fitted)) == pytest.approx(1.0)
 
 
 def test_no_small_change_fits_better() -> None:
     source, target = torch.randn(2, 15, 3, dtype=torch.float64)
-    rotation, translation = fit_rigid(source, target)
+    pose = fit_rigid(source, target)
+    rotation, translation = pose.rotation, pose.translation
 
     def cost(turn: torch.Tensor, shift: torch.Tensor) -> torch.Tensor:
         turned = rotation_from_vector(turn) @ rotation
@@ -164,33 +167,39 @@ def test_fit_ignores_masked_points() -> None:
     source, target = torch.randn(2, 3, 12, 3, dtype=torch.float64)
     valid = torch.rand(3, 12) < 0.6
     source[~valid], target[~valid] = torch.nan, 1e9
-    rotation, translation = fit_rigid(source, target, valid)
+    pose = fit_rigid(source, target, valid)
+    rotation, translation = pose.rotation, pose.translation
     for i in range(3):
         alone = fit_rigid(source[i, valid[i]], target[i, valid[i]])
-        torch.testing.assert_close(rotation[i], alone[0], rtol=0, atol=1e-12)
-        torch.testing.assert_close(translation[i], alone[1], rtol=0, atol=1e-12)
+        torch.testing.assert_close(rotation[i], alone.rotation, rtol=0, atol=1e-12)
+        torch.testing.assert_close(translation[i], alone.translation, rtol=0, atol=1e-12)
 
 
 def test_one_mask_serves_many_point_sets() -> None:
     source, target = torch.randn(2, 4, 10, 3, dtype=torch.float64)
     valid = torch.arange(10) > 3
-    torch.testing.assert_close(fit_rigid(source, target, valid)[0], fit_rigid(source[:, 4:], target[:, 4:])[0])
+    torch.testing.assert_close(
+        fit_rigid(source, target, valid).rotation, fit_rigid(source[:, 4:], target[:, 4:]).rotation
+    )
 
 
 def test_many_masks_serve_one_point_set() -> None:
     source, target = torch.randn(2, 10, 3, dtype=torch.float64)
     valid = torch.rand(4, 10) < 0.7
-    rotation, translation = fit_rigid(source, target, valid)
+    pose = fit_rigid(source, target, valid)
+    rotation, translation = pose.rotation, pose.translation
     for i in range(4):
         alone = fit_rigid(source[valid[i]], target[valid[i]])
-        torch.testing.assert_close((rotation[i], translation[i]), alone, rtol=0, atol=1e-12)
+        torch.testing.assert_close(rotation[i], alone.rotation, rtol=0, atol=1e-12)
+        torch.testing.assert_close(translation[i], alone.translation, rtol=0, atol=1e-12)
 
 
 def test_problem_without_points_does_not_end_the_batch() -> None:
     source, target = torch.randn(2, 2, 10, 3, dtype=torch.float64)
     valid = torch.stack([torch.ones(10), torch.zeros(10)]).bool()
-    rotation, translation = fit_rigid(source, target, valid)
-    torch.testing.assert_close(rotation[0], fit_rigid(source[0], target[0])[0])
+    pose = fit_rigid(source, target, valid)
+    rotation, translation = pose.rotation, pose.translation
+    torch.testing.assert_close(rotation[0], fit_rigid(source[0], target[0]).rotation)
     assert rotation[1].isnan().all()
     assert translation[1].isnan().all()
 
@@ -199,5 +208,10 @@ def test_problem_without_points_does_not_end_the_batch() -> None:
 def test_dtype_follows_the_input(dtype: torch.dtype) -> None:
     vectors = unit(3).to(dtype)
     rotations = rotation_from_vector(vectors)
-    results = (rotations, left_jacobian(vectors), vector_from_rotation(rotations), *fit_rigid(rotations, rotations))
+    results = (
+        rotations,
+        left_jacobian(vectors),
+        vector_from_rotation(rotations),
+        *vars(fit_rigid(rotations, rotations)).values(),
+    )
     assert {result.dtype for result in results} == {dtype}

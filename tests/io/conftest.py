@@ -14,6 +14,7 @@ from lsvision.types import (
     Motion,
     Observability,
     ObservedDirection,
+    Pose,
     Provenance,
     Rig,
     Travel,
@@ -56,7 +57,11 @@ def calibration(small_rig: Rig) -> Calibration:
     n = torch.tensor([-0.0257, 0.9845, 0.1 + 0.2], dtype=torch.float64)
     root = torch.randn(3, 3, dtype=torch.float64) * 1e-4
     board = BoardFit(
-        "scans/Tür 1", 88, torch.eye(3).double(), torch.tensor([1.0, 2.0, 797.3], dtype=torch.float64), 2.1, 0.05
+        scan="scans/Tür 1",
+        corners=88,
+        pose=Pose(torch.eye(3).double(), torch.tensor([1.0, 2.0, 797.3], dtype=torch.float64)),
+        rmse_before_mm=2.1,
+        rmse_after_mm=0.05,
     )
     direction = ObservedDirection((0.0, 0.6, 0.8), 0.05, 2.5e-5, True)
     return Calibration(

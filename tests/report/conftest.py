@@ -14,6 +14,7 @@ from lsvision.types import (
     Motion,
     Observability,
     ObservedDirection,
+    Pose,
     Rig,
 )
 
@@ -44,7 +45,7 @@ def corners() -> BoardCorners:
 def determined() -> Calibration:
     n = torch.tensor([-0.026, 1.02, 0.014], dtype=torch.float64)
     observed = tuple(direction(k, 2e-5 * (k + 1), True) for k in range(3))
-    fit = BoardFit("scans/<first> & last", 9, torch.eye(3).double(), torch.zeros(3).double(), 2.0, 0.5)
+    fit = BoardFit("scans/<first> & last", 9, Pose(torch.eye(3).double(), torch.zeros(3).double()), 2.0, 0.5)
     return Calibration(
         method="joint",
         motion=Motion(n, torch.diag(torch.tensor([2e-5, 4e-5, 6e-5], dtype=torch.float64) ** 2)),

@@ -7,7 +7,15 @@ import pytest
 import torch
 
 from lsvision.errors import ConfigError
-from lsvision.geometry import line_at, scaled_rig, travel_at, triangulate
+from lsvision.geometry import (
+    aligned_rotation,
+    focal_length_px,
+    line_at,
+    scaled_rig,
+    travel_at,
+    triangulate,
+    zero_disparity_mm,
+)
 from lsvision.simulation import (
     Acquisition,
     EncoderConfig,
@@ -78,7 +86,7 @@ def test_reverse_transport_turns_the_image_upside_down(coarse, board, clean, mot
     forward = simulate(coarse, board, scene, motion, clean, Acquisition(PITCH))
     reverse = simulate(coarse, board, scene, motion, clean, Acquisition(PITCH, transport="reverse"))
     # Inside the target: the endless conveyor shows other parts of its texture.
-    covered = torch.cat(list(forward.depth_strips())) < coarse.zero_disparity_mm + scene.conveyor_drop_mm - 3.0
+    covered = torch.cat(list(forward.depth_strips())) < zero_disparity_mm(coarse) + scene.conveyor_drop_mm - 3.0
     inside = -torch.nn.functional.max_pool2d(-covered[None].float(), 9, 1, 4)[0] > 0
     assert inside.sum() > 30_000
     assert (whole(reverse).flip(0) - whole(forward))[inside].abs().max() < 0.1 * 257
@@ -104,13 +112,11 @@ def test_depth_agrees_with_triangulated_corners(coarse, board, clean):
 
 def test_rail_depth_is_its_profile_along_the_motion(coarse, board, clean):
     scene = SceneConfig("rail", defect_spacing_mm=0.0, roll_mark_period_mm=0.0)
-    depth = torch.cat(
-        list(
-            simulate(coarse, board, scene, MotionConfig(1.0, -2.0), clean, Acquisition(PITCH, lines=90)).depth_strips()
-        )
-    )
+    simulation = simulate(coarse, board, scene, MotionConfig(1.0, -2.0), clean, Acquisition(PITCH, lines=90))
+    depth = torch.cat(list(simulation.depth_strips()))
     torch.testing.assert_close(depth[70], depth[5], rtol=0, atol=2e-3)  # nothing changes along a sound, still rail
-    crown = coarse.zero_disparity_mm - scene.rail_rise_mm
+    # The rise is a height, measured along e_z.
+    crown = zero_disparity_mm(coarse) - scene.rail_rise_mm * float(aligned_rotation(simulation.trajectory.n)[2, 2])
     torch.testing.assert_close(float(depth.min()), crown, rtol=0, atol=0.01)
     assert (depth.max() - depth.min()) < 52.0
     faulty = dataclasses.replace(scene, defect_spacing_mm=60.0)
@@ -155,7 +161,7 @@ def test_sheet_shows_its_artwork(small_rig, board, whole):
     points = torch.rand(4000, 2) * torch.tensor([300.0, 220.0]) + 30.0
     in_space = torch.cat([points, torch.zeros(4000, 1)], -1).double() @ simulation.pose.rotation.mT
     x, line, z = simulation.trajectory.project(in_space + simulation.pose.translation).unbind(-1)
-    u = x / z * small_rig.focal_length_px + small_rig.principal_left_px
+    u = x / z * focal_length_px(small_rig) + small_rig.principal_left_px
     image = whole(simulation)
     grid = 2 * torch.stack([u, line], -1) / (u.new_tensor([small_rig.width_px, simulation.lines]) - 1) - 1
     seen = torch.nn.functional.grid_sample(image.permute(2, 0, 1)[None], grid[None, None], align_corners=True)[0, :, 0]

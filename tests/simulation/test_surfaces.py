@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from lsvision.geometry import rotation_from_vector
+from lsvision.geometry import focal_length_px, rotation_from_vector, zero_disparity_mm
 from lsvision.simulation import EncoderConfig, MotionConfig, SceneConfig, SensorConfig, Trajectory
 from lsvision.simulation.defects import defects
 from lsvision.simulation.lighting import line_lights
@@ -28,7 +28,7 @@ def test_plane_view_equals_a_float64_intersection_however_far_the_scan_has_gone(
     pose = Pose(turn, trajectory.pivot + trajectory.position(lines[10]) * trajectory.n)
     view = view_plane(rays, pose, 0.4)
 
-    slope = (columns - full_rig.principal_left_px) / full_rig.focal_length_px
+    slope = (columns - full_rig.principal_left_px) / focal_length_px(full_rig)
     direction = rays.across[:, None] * (slope - rays.middle_slope)[:, None] + rays.ahead[:, None]
     normal = turn[:, 2]
     z = ((pose.translation - rays.origin) @ normal)[:, None] / (direction @ normal)
@@ -59,7 +59,7 @@ def test_footprint_is_the_side_of_a_turned_sample():
 def test_light_is_one_in_the_middle_symmetric_and_falls_off(small_rig):
     lighting, middle = line_lights(small_rig), small_rig.baseline_mm / 2
     aside = torch.linspace(-250.0, 250.0, 101)
-    z = torch.full_like(aside, small_rig.zero_disparity_mm)
+    z = torch.full_like(aside, zero_disparity_mm(small_rig))
     light = lighting.irradiance(middle + aside, z, 0.0, -1.0)
     torch.testing.assert_close(light[50], torch.tensor(1.0), rtol=0, atol=1e-5)
     torch.testing.assert_close(light, light.flip(0), rtol=0, atol=1e-5)

@@ -4,6 +4,7 @@ import cv2
 import pytest
 import torch
 
+from lsvision.geometry import focal_length_px
 from lsvision.image.board.detect import detect_board
 from lsvision.simulation import Acquisition, MotionConfig, SceneConfig, SensorConfig, simulate
 from lsvision.stages.disparity.config import DisparityConfig
@@ -47,7 +48,7 @@ def test_disparity_at_full_size(kind):
     left, right = (torch.cat(list(source.strips(camera))) for camera in ("left", "right"))
     depth = torch.cat(list(source.depth_strips())).double()
     convergence = FULL_RIG.principal_right_px - FULL_RIG.principal_left_px
-    truth = FULL_RIG.focal_length_px * FULL_RIG.baseline_mm / depth - convergence
+    truth = focal_length_px(FULL_RIG) * FULL_RIG.baseline_mm / depth - convergence
 
     def figures(match):
         error = match.disparity - truth

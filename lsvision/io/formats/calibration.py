@@ -20,6 +20,7 @@ from lsvision.types import (
     Iteration,
     Motion,
     Observability,
+    Pose,
     Provenance,
     Scan,
 )
@@ -74,8 +75,7 @@ class BoardEntries(Checked):
         return BoardFit(
             scan=self.scan,
             corners=self.corners,
-            rotation=_float64(self.rotation),
-            translation_mm=_float64(self.translation_mm),
+            pose=Pose(_float64(self.rotation), _float64(self.translation_mm)),
             rmse_before_mm=self.rmse_before_mm,
             rmse_after_mm=self.rmse_after_mm,
         )
@@ -213,8 +213,8 @@ def _board_to_dict(board: BoardFit) -> dict[str, object]:
     return {
         "scan": board.scan,
         "corners": board.corners,
-        "rotation": board.rotation.double().tolist(),
-        "translation_mm": board.translation_mm.double().tolist(),
+        "rotation": board.pose.rotation.double().tolist(),
+        "translation_mm": board.pose.translation.double().tolist(),
         "rmse_before_mm": board.rmse_before_mm,
         "rmse_after_mm": board.rmse_after_mm,
     }

@@ -17,7 +17,7 @@ from lsvision.stages.calibration.methods import estimate
 from lsvision.stages.calibration.model import rotations, squared_residuals, translations
 from lsvision.stages.calibration.observability import observe
 from lsvision.stages.calibration.problem import BoardProblem, MountingPitch
-from lsvision.types import BoardCorners, BoardFit, Calibration, Iteration, Motion, Rig
+from lsvision.types import BoardCorners, BoardFit, Calibration, Iteration, Motion, Pose, Rig
 
 __all__ = ["BatchCalibration", "CalibrationConfig", "calibrate", "calibrate_batch"]
 
@@ -215,8 +215,7 @@ def _board_fits(boards: Sequence[BoardCorners], batch: BatchCalibration) -> tupl
         BoardFit(
             scan=board.scan,
             corners=int(board.valid.sum()),
-            rotation=batch.rotation[i],
-            translation_mm=batch.translation_mm[i],
+            pose=Pose(batch.rotation[i], batch.translation_mm[i]),
             rmse_before_mm=float(batch.board_rmse_before_mm[i]),
             rmse_after_mm=float(batch.board_rmse_after_mm[i]),
         )

@@ -96,6 +96,7 @@ def nominal_problem(
     weight = valid.to(points) / valid.sum(-1, keepdim=True)
     centroid = (weight[..., None] * board_points).sum(-2)
     body = board_points - centroid[..., None, :]
-    rotation, position = fit_rigid(body, displace(points, n), valid)
-    problem = BoardProblem(points, noise_chol, body, centroid, valid, rotation, pitch)
+    fitted = fit_rigid(body, displace(points, n), valid)
+    position = fitted.translation
+    problem = BoardProblem(points, noise_chol, body, centroid, valid, fitted.rotation, pitch)
     return problem, BoardState(torch.zeros_like(position), position, n.expand(*points.shape[:-3], 3)).join()

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 import torch
 
+from lsvision.geometry import focal_length_px, zero_disparity_mm
 from lsvision.stages.disparity.config import DisparityConfig
 from lsvision.stages.disparity.match import measure_strip
 from lsvision.types import Rig
@@ -38,8 +39,8 @@ def test_no_more_pixels_are_bad_than_with_opencv(motorcycle):
     )  # fmt: skip
     expected = torch.from_numpy(peer.compute(*grey)).float() / 16
     expected = torch.where(expected >= 0, expected, torch.nan)
-    z0 = RIG.zero_disparity_mm
-    highest = z0 - RIG.focal_length_px * RIG.baseline_mm / (HIGHEST_PX + 31.086)
+    z0 = zero_disparity_mm(RIG)
+    highest = z0 - focal_length_px(RIG) * RIG.baseline_mm / (HIGHEST_PX + 31.086)
     match = measure_strip(left, right, RIG, DisparityConfig(height_range_mm=(0.0, highest), largest_sigma_px=0.2))
     assert bad_share(expected, truth) == pytest.approx(0.2148, abs=0.01)
     assert bad_share(match.disparity, truth) <= bad_share(expected, truth)

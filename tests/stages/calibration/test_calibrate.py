@@ -38,8 +38,8 @@ def test_three_tilts_find_the_motion_within_their_own_sigmas(method):
     assert result.rmse_before_mm > 2.0
     assert (result.method, result.rig) == (method, RIG)
     for fit, rotation, translation in zip(result.boards, corners.rotation, corners.translation, strict=True):
-        torch.testing.assert_close(fit.rotation, rotation, rtol=0, atol=2e-3)
-        torch.testing.assert_close(fit.translation_mm, translation, rtol=0, atol=0.1)
+        torch.testing.assert_close(fit.pose.rotation, rotation, rtol=0, atol=2e-3)
+        torch.testing.assert_close(fit.pose.translation, translation, rtol=0, atol=0.1)
         assert fit.corners == 88
 
 
@@ -64,7 +64,7 @@ def test_before_and_after_are_the_rmse_of_the_residuals():
     squares = []
     for points, body, fit in zip(corners.points, corners.board_points, result.boards, strict=True):
         moved = points * torch.tensor([1.0, 0.0, 1.0]) + points[:, 1:2] * result.motion.n
-        error = moved - transform(fit.rotation, fit.translation_mm, body)
+        error = moved - transform(fit.pose.rotation, fit.pose.translation, body)
         squares.append(error.square().sum(-1))
         assert fit.rmse_after_mm == pytest.approx(squares[-1].mean().sqrt().item())
     assert result.rmse_after_mm == pytest.approx(torch.cat(squares).mean().sqrt().item())

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from lsvision.errors import BoardNotFoundError
-from lsvision.geometry import triangulate
+from lsvision.geometry import focal_length_px, object_pitch_mm, triangulate, zero_disparity_mm
 from lsvision.image.board.refine import DetectedCorners
 from lsvision.simulation import EncoderConfig
 from lsvision.stages.corners.config import CornersConfig
@@ -47,12 +47,12 @@ def test_one_corner_by_hand():
     scan = Scan(Path("hand"), SMALL_RIG, Travel(PITCH), StereoPair(BLANK, BLANK))
     measured = _triangulated(scan, left, right, CornersConfig())
     points, covariance, valid = measured.points, measured.covariance, measured.valid
-    z0 = SMALL_RIG.zero_disparity_mm
+    z0 = zero_disparity_mm(SMALL_RIG)
     torch.testing.assert_close(
         points[0], torch.tensor([0.0, 100.25 * PITCH, z0], dtype=torch.float64), rtol=0, atol=1e-9
     )
-    by_disparity = z0**2 / (SMALL_RIG.focal_length_px * SMALL_RIG.baseline_mm)
-    expected = torch.tensor([0.02 * SMALL_RIG.object_pitch_mm, 0.02 / 2**0.5 * PITCH, 0.02 * 2**0.5 * by_disparity])
+    by_disparity = z0**2 / (focal_length_px(SMALL_RIG) * SMALL_RIG.baseline_mm)
+    expected = torch.tensor([0.02 * object_pitch_mm(SMALL_RIG), 0.02 / 2**0.5 * PITCH, 0.02 * 2**0.5 * by_disparity])
     torch.testing.assert_close(covariance[0].diagonal().sqrt(), expected.double(), rtol=1e-6, atol=0)
     apart = dataclasses.replace(left, position=position + torch.tensor([[0.0, 1.5]]).double())
     assert valid.all()

@@ -8,9 +8,17 @@ import torch
 from torch import Tensor
 
 from lsvision.errors import ConfigError
-from lsvision.geometry import line_at, product_axes, to_product, travel_at
+from lsvision.geometry import (
+    focal_length_px,
+    line_at,
+    object_pitch_mm,
+    product_axes,
+    to_product,
+    travel_at,
+    zero_disparity_mm,
+)
 from lsvision.image.tiling import PIXEL_PARTS
-from lsvision.simulation import MotionConfig, SceneConfig, SensorConfig, simulate
+from lsvision.simulation import Acquisition, MotionConfig, SceneConfig, SensorConfig, simulate
 from lsvision.stages.correction.config import CorrectionConfig
 from lsvision.stages.correction.correct import Correction, correct_scan
 from lsvision.stages.correction.grid import plan_product
@@ -58,7 +66,7 @@ def model_source(grid, motion: Motion, travel: Travel, depth: float) -> tuple[Te
     e_x, e_y, _ = product_axes(motion.n)
     x = (q_x - depth * e_x[2]) / e_x[0]
     y = (q_y - x * e_y[0] - depth * e_y[2]) / torch.linalg.vector_norm(motion.n)
-    column = RIG.principal_left_px + x / depth * RIG.focal_length_px
+    column = RIG.principal_left_px + x / depth * focal_length_px(RIG)
     return line_at(travel, y), column.expand(grid.rows, -1)
 
 
@@ -79,16 +87,16 @@ def test_source_and_height_of_a_plane_agree_with_the_model(case):
         off = (strip.source[inside][:, part].double() - true[inside]).abs()
         assert (off <= 0.5 / PIXEL_PARTS + 1e-6 + 1e-6 * true[inside]).all()  # the map tells what was sampled
     _, _, e_z = product_axes(motion.n)
-    x = (true_column - RIG.principal_left_px) / RIG.focal_length_px * DEPTH
-    middle = torch.tensor([RIG.baseline_mm / 2, 0.0, RIG.zero_disparity_mm], dtype=torch.float64)
+    x = (true_column - RIG.principal_left_px) / focal_length_px(RIG) * DEPTH
+    middle = torch.tensor([RIG.baseline_mm / 2, 0.0, zero_disparity_mm(RIG)], dtype=torch.float64)
     height = e_z @ middle - (x * e_z[0] + DEPTH * e_z[2])
     assert (strip.height.double() - height)[inside].abs().max() < 1e-4
 
 
 def test_nominal_product_of_the_zero_plane_is_the_scan():
     # On the plane of zero disparity a cell of one pixel's width on the object is one pixel of the image.
-    pitch = RIG.object_pitch_mm
-    z0 = RIG.zero_disparity_mm
+    pitch = object_pitch_mm(RIG)
+    z0 = zero_disparity_mm(RIG)
     scan = scan_of(flat(z0).double(), Travel(pitch))
     motion = motion_of((0.0, 1.0, 0.0))
     grid = plan_product(scan, motion, CONFIG)
@@ -138,14 +146,14 @@ def test_at_a_step_the_nearer_surface_wins():
     strip = Correction(scan, depth_of(scan), motion, CONFIG, grid).strip((40, 80))
     q_x = grid.origin_x_mm + grid.pitch_mm * torch.arange(grid.columns).double()
     edge_near, edge_far = (
-        (k - RIG.principal_left_px) / RIG.focal_length_px * z for k, z in ((180, 780.0), (179, 800.0))
+        (k - RIG.principal_left_px) / focal_length_px(RIG) * z for k, z in ((180, 780.0), (179, 800.0))
     )
     assert edge_near < edge_far - grid.pitch_mm
-    high = RIG.zero_disparity_mm - 780.0
+    high = zero_disparity_mm(RIG) - 780.0
     both = (q_x > edge_near) & (q_x < edge_far)
     assert both.any()
     torch.testing.assert_close(strip.height[:, both], torch.full_like(strip.height[:, both], high), rtol=0, atol=1e-4)
-    assert set(strip.height[strip.valid].sub(RIG.zero_disparity_mm - 790.0).sign().tolist()) == {-1.0, 1.0}
+    assert set(strip.height[strip.valid].sub(zero_disparity_mm(RIG) - 790.0).sign().tolist()) == {-1.0, 1.0}
     heights = strip.height[strip.valid]
     assert (((heights - high).abs() < 1e-3) | ((heights - high + 20).abs() < 1e-3)).all()  # nothing in between
 
@@ -157,7 +165,7 @@ def test_behind_a_step_nothing_is_interpolated():
     strip = Correction(scan, depth_of(scan), motion, CONFIG, grid).strip((40, 80))
     q_x = grid.origin_x_mm + grid.pitch_mm * torch.arange(grid.columns).double()
     edge_near, edge_far = (
-        (k - RIG.principal_left_px) / RIG.focal_length_px * z for k, z in ((119, 780.0), (120, 800.0))
+        (k - RIG.principal_left_px) / focal_length_px(RIG) * z for k, z in ((119, 780.0), (120, 800.0))
     )
     hidden = (q_x > edge_near) & (q_x < edge_far)
     assert hidden.sum() >= 2
@@ -209,9 +217,9 @@ def test_the_grid_holds_the_whole_field(case):
     grid = plan_product(scan, motion, CONFIG)
     u = torch.tensor([0.0, RIG.width_px - 1.0]).double()
     for height in CONFIG.height_range_mm:
-        z = RIG.zero_disparity_mm - height
+        z = zero_disparity_mm(RIG) - height
         for line in (0.0, LINES - 1.0):
-            x = (u - RIG.principal_left_px) / RIG.focal_length_px * z
+            x = (u - RIG.principal_left_px) / focal_length_px(RIG) * z
             y = travel_at(travel, torch.full_like(u, line))
             q = to_product(torch.stack([x, y, torch.full_like(x, z)], -1), motion.n)
             row, column = (q[:, 1] - grid.origin_y_mm) / PITCH, (q[:, 0] - grid.origin_x_mm) / PITCH
@@ -274,7 +282,9 @@ def test_an_overview_of_many_lines_a_cell_is_the_same_in_any_strips(resampler):
 def test_heights_count_from_the_middle_of_zero_disparity(angles):
     """A rail 22 mm before that point reads 22.00, the conveyor 26 mm behind it -26.00, at any skew of the motion."""
     motion = MotionConfig(angle_x_deg=angles[0], angle_z_deg=angles[1], stretch=1.0246)
-    source = simulate(SMALL_RIG, BOARD, FLAWLESS_RAIL, motion, SensorConfig(supersampling=1), PITCH, lines=120)
+    source = simulate(
+        SMALL_RIG, BOARD, FLAWLESS_RAIL, motion, SensorConfig(supersampling=1), Acquisition(PITCH, lines=120)
+    )
     scan = depth_scan(source)
     (strip,) = correct_scan(scan, depth_of(scan), Motion(source.trajectory.n, torch.zeros(3, 3).double()), ONE_STRIP)
     heights = strip.height[strip.valid]

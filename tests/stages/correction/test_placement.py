@@ -9,7 +9,7 @@ import torch
 import torch.nn.functional as F  # noqa: N812
 from torch import Tensor
 
-from lsvision.geometry import ProductFrame, scaled_rig
+from lsvision.geometry import ProductFrame, focal_length_px, scaled_rig, zero_disparity_mm
 from lsvision.simulation import (
     Acquisition,
     EncoderConfig,
@@ -114,5 +114,5 @@ def test_at_full_size_the_matched_depth_puts_pixels_within_a_tenth(kind: str, st
     assert (shift > 0.3).sum() <= torch.erfc(0.3 / (told * math.sqrt(2))).sum()
     assert (shift > 0.3).double().mean() <= 0.002
     assert 0.7 < (error / sigma[:, 2]).square().mean().sqrt() < 1.3
-    pixel_mm = scan.rig.zero_disparity_mm**2 / (scan.rig.focal_length_px * scan.rig.baseline_mm)
+    pixel_mm = zero_disparity_mm(scan.rig) ** 2 / (focal_length_px(scan.rig) * scan.rig.baseline_mm)
     assert error.abs().median() <= 0.09 * pixel_mm

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from lsvision.geometry import ProductFrame, depth_sigma, displace, product_axes
+from lsvision.geometry import ProductFrame, depth_sigma, displace, focal_length_px, product_axes
 from lsvision.stages.correction.config import CorrectionConfig
 from lsvision.stages.correction.correct import correct_scan
 from lsvision.stages.correction.uncertainty import drift_per_metre, position_sigma
@@ -30,7 +30,7 @@ def test_equals_monte_carlo(transport) -> None:
     log = 7.0 + PITCH * torch.arange(500, dtype=torch.float64)
     scan = scan_of(500, Travel(PITCH, log, transport))
     line, column, z = 444.0, 400.0, 790.0
-    slope = (column - SMALL_RIG.principal_left_px) / SMALL_RIG.focal_length_px
+    slope = (column - SMALL_RIG.principal_left_px) / focal_length_px(SMALL_RIG)
     axes, y = product_axes(N), (-1.0 if transport == "reverse" else 1.0) * 444 * PITCH
     noise = torch.randn(200_000, 4, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
     drawn_z = z + 0.3 * noise[:, 0]
@@ -46,7 +46,7 @@ def test_by_hand() -> None:
     # Straight below the left camera, the depth of a still object: one axis, no travel.
     motion = Motion(torch.tensor([0.0, 1.0, 0.0]).double(), torch.diag(torch.tensor([1e-6, 4e-6, 9e-6]).double()))
     z, c = 800.0, SMALL_RIG.principal_left_px
-    matched = 0.1 * z**2 / (SMALL_RIG.focal_length_px * SMALL_RIG.baseline_mm)
+    matched = 0.1 * z**2 / (focal_length_px(SMALL_RIG) * SMALL_RIG.baseline_mm)
     known = depth_sigma(SMALL_RIG, torch.full((1, 1), z, dtype=torch.float64), 0.1)
     frame = ProductFrame(SMALL_RIG, Travel(PITCH), motion.n)
     sigma = position_sigma(frame, motion.covariance, torch.full((1, 1), c).double(), torch.zeros(1, 1).double(), known)

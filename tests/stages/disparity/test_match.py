@@ -7,7 +7,14 @@ from pathlib import Path
 import pytest
 import torch
 
-from lsvision.geometry import depth_at, depth_sigma, triangulate, triangulation_jacobian
+from lsvision.geometry import (
+    depth_at,
+    depth_sigma,
+    focal_length_px,
+    triangulate,
+    triangulation_jacobian,
+    zero_disparity_mm,
+)
 from lsvision.image.brightness import gray
 from lsvision.image.stereo.sgbm import GrayPair, match_sgbm
 from lsvision.simulation import SceneConfig
@@ -42,7 +49,7 @@ def test_depth_equals_triangulation_pixel_by_pixel():
     disparity = torch.tensor([[0.0, 3.5, torch.nan, -7.25]])
     depth = depth_at(SMALL_RIG, disparity)
     assert depth.dtype == torch.float32
-    assert depth[0, 0] == pytest.approx(SMALL_RIG.zero_disparity_mm)
+    assert depth[0, 0] == pytest.approx(zero_disparity_mm(SMALL_RIG))
     for column, value in enumerate(disparity[0].double()):
         expected = triangulate(SMALL_RIG, torch.tensor(float(column)).double(), value)[1]
         torch.testing.assert_close(depth[0, column].double(), expected, rtol=1e-6, atol=0, equal_nan=True)
@@ -141,7 +148,7 @@ def test_hidden_pixels_are_separated_from_failed_ones():
 
 def to_disparity(depth, truth):
     """Error of depths in pixels of disparity."""
-    scale = SMALL_RIG.focal_length_px * SMALL_RIG.baseline_mm
+    scale = focal_length_px(SMALL_RIG) * SMALL_RIG.baseline_mm
     return scale / depth.double() - scale / truth.double()
 
 
