@@ -33,13 +33,15 @@ WORK_FOLDER = ".work"
 class Place:
     """Where a run works: its ledger, its output, and the folder below which depth and unfinished products lie.
 
-    ``verify`` asks for every product to be read back before it gets its name.
+    ``keep_depth`` has the matched depth stored, which many workers and later corrections read; without it, depth is
+    matched where it is read. ``verify`` asks for every product to be read back before it gets its name.
     """
 
     ledger: Ledger
     output: Path
     work: Path
     processing: Processing
+    keep_depth: bool = True
     verify: bool = False
 
 
@@ -98,6 +100,7 @@ class ScanJob:
 
     def finish(self) -> ScanRow:
         """Record that the scan is done, and remove what was made on the way, except its depth."""
+        self._work.mkdir(parents=True, exist_ok=True)
         for other in self._work.iterdir():
             if other == self._depth_store:
                 remove_partial_chunks(other)
@@ -149,13 +152,16 @@ class ScanJob:
             self._place.ledger.forget_strips(planned.key, "product")
             partial = working.with_name(f"{working.name}.partial")
             with naming_full_disk(self._product.final):
+                self._work.mkdir(parents=True, exist_ok=True)
                 layout = product_layout(planned, self._place.processing, self._row.input_sha256, self._strips_key)
                 create_product(partial, layout)
                 partial.rename(working)
         motion = planned.calibration.calibration.motion
         n, covariance = tuple(motion.n.tolist()), tuple(map(tuple, motion.covariance.tolist()))
         store = str(self._depth_store) if self._depth_store else None
-        source = CorrectionInput(planned.files, store, n, covariance, planned.correction)
+        source = CorrectionInput(
+            planned.files, store, self._place.processing.disparity, n, covariance, planned.correction
+        )
         work = [CorrectStrip(source, number, self._product) for number in range(planned.product_strips)]
         return self._missing("product", self._strips_key, work)
 
@@ -209,7 +215,9 @@ class ScanJob:
 
     @property
     def _depth_store(self) -> Path | None:
-        return self._work / f"depth-{self._depth_key[:16]}" if self.planned.matched else None
+        """Where the matched depth is stored; None where none is."""
+        stored = self.planned.matched and self._place.keep_depth
+        return self._work / f"depth-{self._depth_key[:16]}" if stored else None
 
     @property
     def _product(self) -> ProductPlace:

@@ -60,7 +60,8 @@ def process_one(planned: PlannedScan, processing: Processing, output: Path, prog
     lock = work.with_suffix(".lock")
     with sole_run(output, lock), _temporary(work, lock):
         with Ledger(work / LEDGER_FILE) as ledger, InProcessEngine() as engine:
-            (row,) = process_scans([planned], engine, Place(ledger, output, work, processing), progress)
+            place = Place(ledger, output, work, processing, keep_depth=False)
+            (row,) = process_scans([planned], engine, place, progress)
             measured = measured_cells(strip for strip in ledger.strips(planned.key) if strip.stage == "product")
         if row.status == "failed":
             raise LsvisionError(row.error)

@@ -4,6 +4,7 @@ Each writes chunks, or a folder, that no other writes, and the same bits however
 that was lost half-way, or ran twice, does no harm.
 """
 
+import threading
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -104,10 +105,14 @@ class MatchStrip:
 
 @dataclass(frozen=True)
 class CorrectionInput:
-    """What the strips of a product are corrected from; the depth is the scan's own where there is no store of it."""
+    """What the strips of a product are corrected from.
+
+    Where there is no store of the depth, it is the scan's own, or matched where it is read.
+    """
 
     scan: ScanFiles
     depth_store: str | None
+    disparity: DisparityConfig
     n: tuple[float, ...]
     covariance: tuple[tuple[float, ...], ...]
     config: CorrectionConfig
@@ -173,13 +178,19 @@ def _open_scan(files: ScanFiles) -> Scan:
     return read_scan(files.path, repair_encoder=files.repair_encoder)
 
 
-# Neighbouring strips see the same lines at their seam.
-@lru_cache(maxsize=1)
 def _open_correction(source: CorrectionInput) -> Correction:
-    scan = _open_scan(source.scan)
-    depth = depth_of(scan) if source.depth_store is None else open_depth_store(source.depth_store)
-    motion = Motion(*(torch.tensor(values, dtype=torch.float64) for values in (source.n, source.covariance)))
-    return Correction(scan, depth, motion, source.config, plan_product(scan, motion, source.config))
+    """The latest of the thread stays open: neighbouring strips see the same lines at their seam."""
+    if getattr(_opened, "source", None) != source:
+        scan = _open_scan(source.scan)
+        depth = open_depth_store(source.depth_store) if source.depth_store else depth_of(scan, source.disparity)
+        motion = Motion(*(torch.tensor(values, dtype=torch.float64) for values in (source.n, source.covariance)))
+        _opened.correction = Correction(scan, depth, motion, source.config, plan_product(scan, motion, source.config))
+        _opened.source = source
+    correction: Correction = _opened.correction
+    return correction
+
+
+_opened = threading.local()
 
 
 # Opening costs as much as computing a small strip; folders of one name are always laid out alike.

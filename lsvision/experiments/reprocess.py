@@ -80,7 +80,7 @@ def run_reprocess(settings: ReprocessSettings, folder: Path) -> None:
         plan = _plan(settings, output, ledger.scans())
         _log_plan(plan, ledger.seconds_per_line(), settings.engine)
         begin = time.perf_counter()
-        place = Place(ledger, output, output / WORK_FOLDER, _processing(settings), settings.verify)
+        place = Place(ledger, output, output / WORK_FOLDER, _processing(settings), verify=settings.verify)
         processed = _process(settings, plan, place)
         for found, problem in plan.faulty.items():
             ledger.put_scan(ScanRow(found.key, str(found.path), "failed", error=problem))

@@ -100,7 +100,7 @@ def process(
         plan = plan_run(
             find_scans(str(archive), output), read_calibrations(calibration), processing, ledger.scans(), output
         )
-        place = Place(ledger, output, output / WORK_FOLDER, processing, verify)
+        place = Place(ledger, output, output / WORK_FOLDER, processing, verify=verify)
         with engine or InProcess() as running:
             return process_scans(plan.to_do, running, place, on_done), running
 
