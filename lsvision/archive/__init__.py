@@ -1,50 +1,54 @@
-"""Archives of scans: found, planned, worked through in strips on many workers, and booked in a ledger."""
+"""Archives of scans: found, planned, processed in strips on many workers, and recorded in a ledger."""
 
-from lsvision.archive.driver import run_jobs
+from lsvision.archive.driver import damaged_products, process_scans
+from lsvision.archive.engines.in_process import InProcessEngine
 from lsvision.archive.engines.local import LocalEngine
 from lsvision.archive.engines.protocol import Engine, EngineConfig, worker_count
-from lsvision.archive.job import Place, scan_job, verify_job
+from lsvision.archive.job import WORK_FOLDER, Place
 from lsvision.archive.ledger import LEDGER_FILE, Ledger, ScanRow, StripRow, ledger_lines
 from lsvision.archive.lock import sole_run
-from lsvision.archive.plan import (
-    Plan,
-    PlannedScan,
-    Processing,
-    plan_run,
-    predicted_bytes,
-    predicted_seconds,
-    product_path,
-)
+from lsvision.archive.one_scan import FinishedProduct, plan_one, process_one
+from lsvision.archive.plan import Plan, plan_run, predicted_bytes, predicted_seconds
+from lsvision.archive.planned import PlannedScan, Processing
+from lsvision.archive.product import product_path
 from lsvision.archive.sources.calibrations import DatedCalibration, calibration_for, read_calibrations
 from lsvision.archive.sources.catalogue import Found, find_scans
 from lsvision.archive.sources.remote import local_archive
+from lsvision.archive.tasks import Outcome, Task, product_rows
 
 __all__ = [
     "LEDGER_FILE",
+    "WORK_FOLDER",
     "DatedCalibration",
     "Engine",
     "EngineConfig",
+    "FinishedProduct",
     "Found",
+    "InProcessEngine",
     "Ledger",
     "LocalEngine",
+    "Outcome",
     "Place",
     "Plan",
     "PlannedScan",
     "Processing",
     "ScanRow",
     "StripRow",
+    "Task",
     "calibration_for",
+    "damaged_products",
     "find_scans",
     "ledger_lines",
     "local_archive",
+    "plan_one",
     "plan_run",
     "predicted_bytes",
     "predicted_seconds",
+    "process_one",
+    "process_scans",
     "product_path",
+    "product_rows",
     "read_calibrations",
-    "run_jobs",
-    "scan_job",
     "sole_run",
-    "verify_job",
     "worker_count",
 ]

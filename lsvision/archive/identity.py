@@ -1,34 +1,24 @@
-"""Hashes that tell whether a result still follows from what is there."""
+"""Hashes that say whether a result still follows from its inputs."""
 
 import hashlib
 import json
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 from lsvision.errors import FileFormatError
-from lsvision.io.formats.scan import FILE_KEYS
-from lsvision.io.formats.validation import read_yaml
+from lsvision.io import scan_files
 from lsvision.stages.correction.config import CorrectionConfig
 from lsvision.stages.disparity.config import DisparityConfig
 
 
-def stamp_of(folder: Path) -> str:
-    """Hash of path, size and time of change of every file of a scan: equal as long as nobody touched them.
+@dataclass(frozen=True)
+class ScanFiles:
+    """A scan on disk as every worker opens it; ``stamp`` changes with its files."""
 
-    Raises:
-        FileFormatError: ``scan.yaml`` cannot be read.
-    """
-    data = read_yaml(folder / "scan.yaml")
-    named = [folder / str(data[key]) for key in FILE_KEYS if key in data] if isinstance(data, dict) else []
-    files = [folder / "scan.yaml"]
-    for entry in named:
-        files += sorted(file for file in entry.rglob("*") if file.is_file()) if entry.is_dir() else [entry]
-    try:
-        states = [(str(file), file.stat().st_size, file.stat().st_mtime_ns) for file in files if file.exists()]
-    except OSError as error:
-        raise FileFormatError(folder, f"cannot be read: {error.strerror}") from error
-    return key_of(states)
+    path: str
+    stamp: str
+    repair_encoder: bool
 
 
 def key_of(*values: Any) -> str:
@@ -36,13 +26,37 @@ def key_of(*values: Any) -> str:
     return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()
 
 
-def disparity_key(input_sha256: str, config: DisparityConfig, with_sigma: bool, version: str) -> str:
-    """What the depth of a scan's lines depends on."""
+def stamp_of(folder: Path) -> str:
+    """Hash of path, size and time of change of every file of a scan: equal as long as the files are untouched.
+
+    Raises:
+        FileFormatError: ``scan.yaml`` cannot be read.
+    """
+    try:
+        states = [
+            (str(file), file.stat().st_size, file.stat().st_mtime_ns) for file in scan_files(folder) if file.exists()
+        ]
+    except OSError as error:
+        raise FileFormatError(folder, f"cannot be read: {error.strerror}") from error
+    return key_of(states)
+
+
+def depth_key(input_sha256: str, config: DisparityConfig, with_sigma: bool, version: str) -> str:
+    """Hash of everything that the depth of a scan's lines depends on."""
     return key_of(input_sha256, asdict(config), with_sigma, version)
 
 
-def product_key(depth_key: str, calibration_sha256: str, config: CorrectionConfig, repair_encoder: bool) -> str:
-    """What a product depends on; the height of its strips is not among it, they give the same bits at any."""
+def product_key(depth: str, calibration_sha256: str, config: CorrectionConfig, repair_encoder: bool) -> str:
+    """Hash of everything that a product depends on; the height of its strips is not part of it: any gives equal bits.
+
+    Args:
+        depth: the ``depth_key``.
+    """
+    return key_of(depth, calibration_sha256, options_without_strips(config), repair_encoder)
+
+
+def options_without_strips(config: CorrectionConfig) -> dict[str, Any]:
+    """Options of a correction that a product's cells depend on."""
     options = asdict(config)
     del options["strip_rows"]
-    return key_of(depth_key, calibration_sha256, options, repair_encoder)
+    return options

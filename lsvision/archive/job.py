@@ -1,186 +1,225 @@
-"""What has to happen to one scan, step by step, given what the ledger says was done before."""
+"""The work on one scan: hash, match, correct, finish; each step only where its result is missing."""
 
 import shutil
-from collections.abc import Generator, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 
 from lsvision import __version__
-from lsvision.archive.identity import disparity_key, key_of, product_key
-from lsvision.archive.ledger import Ledger, ScanRow, Stage
-from lsvision.archive.plan import PlannedScan, Processing, product_path
-from lsvision.archive.tasks import (
+from lsvision.archive.depth_store import create_depth_store, remove_partial_chunks
+from lsvision.archive.identity import depth_key, key_of, product_key
+from lsvision.archive.ledger import Ledger, ScanRow, Stage, StripRow, measured_cells
+from lsvision.archive.planned import PlannedScan, Processing
+from lsvision.archive.product import check_own, is_finished, product_layout, product_path
+from lsvision.archive.tasks import Outcome, Strip, Task
+from lsvision.archive.work import (
+    CorrectionInput,
     CorrectStrip,
     FinishProduct,
     HashInput,
+    InputHash,
     MatchStrip,
-    ScanFiles,
-    Task,
-    TaskResult,
-    VerifyProduct,
+    ProductPlace,
+    StripResult,
     Work,
-    create_depth_store,
-    is_finished,
-    remove_partial_chunks,
 )
-from lsvision.geometry import ProductFrame
-from lsvision.io import ProductLayout, create_product, read_scan
-from lsvision.types import Scan
+from lsvision.io import create_product, naming_full_disk
 
 WORK_FOLDER = ".work"
-
-# A job yields tasks that may run in any order and at once, and is sent their results when all of them are done.
-Job = Generator[list[Task], Sequence[TaskResult], ScanRow]
 
 
 @dataclass(frozen=True)
 class Place:
-    """Where a run works: its ledger, its output, what it does to every scan, and whether products are read back."""
+    """Where a run works: its ledger, its output, and the folder below which depth and unfinished products lie.
+
+    ``keep_depth`` has the matched depth stored, which many workers and later corrections read; without it, depth is
+    matched where it is read. ``verify`` asks for every product to be read back before it gets its name.
+    """
 
     ledger: Ledger
     output: Path
+    work: Path
     processing: Processing
-    verify: bool
+    keep_depth: bool = True
+    verify: bool = False
 
 
-def scan_job(planned: PlannedScan, place: Place) -> Job:
-    """Hash, match, correct, finish: every step only where its result is not there already.
+class ScanJob:
+    """The work on one scan, step by step.
 
-    Returns:
-        The scan's row for the ledger.
+    The ledger and the files say what is missing, nothing else: a job goes on where an earlier one of the same scan was
+    ended, whenever that was. The ledger's row of the scan says that it is being worked on from here on.
     """
-    row = _first_row(planned, place)
-    if not row.input_sha256:
-        (hashed,) = yield [Task(planned.key, HashInput(_files(planned, place)))]
-        row = replace(row, input_sha256=hashed.value)
-    place.ledger.put_scan(row)
-    work = place.output / WORK_FOLDER / key_of(planned.key)[:16]
-    work.mkdir(parents=True, exist_ok=True)
-    processing = place.processing
-    depth_key = disparity_key(row.input_sha256, processing.disparity, processing.with_sigma, __version__)
-    depth = work / f"depth-{depth_key[:16]}" if planned.matched else None
-    if depth is not None:
-        yield _matching(planned, place, depth, depth_key)
 
-    key = product_key(depth_key, planned.calibration.sha256, processing.correction, processing.repair_encoder)
-    strips_key = key_of(key, planned.correction.strip_rows)
-    product, target = work / f"product-{strips_key[:16]}.zarr", product_path(place.output, planned.key)
-    if not _is_renamed(planned, place, product, target, strips_key):
-        yield _correcting(planned, place, depth, product, strips_key)
-        measured = sum(strip.measured for strip in place.ledger.done(planned.key, "product", strips_key).values())
-        yield [Task(planned.key, FinishProduct(str(product), str(target), strips_key, measured, place.verify))]
-    for other in work.iterdir():
-        if other == depth:
-            remove_partial_chunks(other)
-        else:
-            shutil.rmtree(other, ignore_errors=True)
-    return _last_row(row, planned, place, strips_key)
+    def __init__(self, planned: PlannedScan, place: Place) -> None:
+        self.planned, self._place = planned, place
+        known = place.ledger.scan(planned.key)
+        untouched = known is not None and known.stamp == planned.files.stamp
+        place.ledger.put_scan(
+            ScanRow(
+                scan=planned.key,
+                path=planned.files.path,
+                status="running",
+                lines=planned.lines,
+                stamp=planned.files.stamp,
+                input_sha256=known.input_sha256 if known is not None and untouched else "",
+                calibration=str(planned.calibration.path),
+                calibration_sha256=planned.calibration.sha256,
+                config_sha256=place.processing.sha256,
+                version=__version__,
+            )
+        )
 
+    def next_tasks(self) -> list[Task]:
+        """Tasks of the first step whose result is missing, to be run in any order and at once; none when all are there.
 
-def verify_job(planned: PlannedScan, place: Place) -> Job:
-    """Read an unchanged scan's product back, and make it anew where it is damaged."""
-    row = place.ledger.scan(planned.key)
-    measured = sum(strip.measured for strip in place.ledger.strips(planned.key) if strip.stage == "product")
-    target = product_path(place.output, planned.key)
-    (checked,) = yield [Task(planned.key, VerifyProduct(str(target), measured))]
-    if row is not None and not checked.value:
+        Raises:
+            FileFormatError: the scan cannot be read any more, or its product would replace that of another scan.
+            WriteError: the disk is full.
+        """
+        return self._hashing() or self._matching() or self._correcting() or self._finishing()
+
+    def record(self, task: Task, outcome: Outcome) -> None:
+        """Record what came of a task."""
+        result = outcome.result
+        if isinstance(result, InputHash):
+            self._place.ledger.put_scan(replace(self._row, input_sha256=result.sha256))
+        if task.strip is not None:
+            row = StripRow(
+                task.scan, task.strip.stage, task.strip.number, task.strip.key,
+                "failed" if outcome.error else "done", outcome.error or "", seconds=outcome.seconds,
+            )  # fmt: skip
+            if isinstance(result, StripResult):
+                cells = result.measured
+                row = replace(
+                    row, lines=result.lines, measured_cells=cells.count, lowest_mm=cells.lowest_mm,
+                    highest_mm=cells.highest_mm,
+                )  # fmt: skip
+            self._place.ledger.put_strip(row)
+
+    def finish(self) -> ScanRow:
+        """Record that the scan is done, and remove what was made on the way, except its depth."""
+        self._work.mkdir(parents=True, exist_ok=True)
+        for other in self._work.iterdir():
+            if other == self._depth_store:
+                remove_partial_chunks(other)
+            else:
+                shutil.rmtree(other, ignore_errors=True)
+        strips = self._place.ledger.strips(self.planned.key)
+        cells = self.planned.grid.rows * self.planned.grid.columns
+        row = replace(
+            self._row,
+            status="done",
+            seconds=sum(strip.seconds for strip in strips),
+            measured_share=self._measured_cells() / cells,
+        )
+        self._place.ledger.put_scan(row)
         return row
-    place.ledger.forget_strips(planned.key, "product")
-    return (yield from scan_job(planned, place))
 
+    def fail(self, error: str) -> ScanRow:
+        """Record why the scan failed; what is done of it is kept."""
+        row = replace(self._row, status="failed", error=error)
+        self._place.ledger.put_scan(row)
+        return row
 
-def _matching(planned: PlannedScan, place: Place, depth: Path, key: str) -> list[Task]:
-    config, with_sigma = place.processing.disparity, place.processing.with_sigma
-    if not depth.is_dir():
-        place.ledger.forget_strips(planned.key, "disparity")
-        create_depth_store(depth, planned.lines, planned.width, config.work_lines, with_sigma=with_sigma)
-    count = -(-planned.lines // config.work_lines)
-    files = _files(planned, place)
-    work = [MatchStrip(files, number, str(depth), config, with_sigma) for number in range(count)]
-    return _missing(planned, place, "disparity", key, work)
+    def _hashing(self) -> list[Task]:
+        if self._row.input_sha256:
+            return []
+        return [Task(self.planned.key, HashInput(self.planned.files))]
 
+    def _matching(self) -> list[Task]:
+        if self._depth_store is None:
+            return []
+        config, with_sigma = self._place.processing.disparity, self._place.processing.with_sigma
+        planned, store = self.planned, self._depth_store
+        if not store.is_dir():
+            check_own(Path(self._product.final), planned, self._row.input_sha256)
+            self._place.ledger.forget_strips(planned.key, "disparity")
+            with naming_full_disk(store):
+                self._work.mkdir(parents=True, exist_ok=True)
+                create_depth_store(store, planned.lines, planned.width, config.work_lines, with_sigma=with_sigma)
+        strips = range(-(-planned.lines // config.work_lines))
+        work = [MatchStrip(planned.files, number, str(store), config, with_sigma) for number in strips]
+        return self._missing("disparity", self._depth_key, work)
 
-def _correcting(planned: PlannedScan, place: Place, depth: Path | None, product: Path, key: str) -> list[Task]:
-    if not product.is_dir():
-        place.ledger.forget_strips(planned.key, "product")
-        scan = read_scan(planned.path, repair_encoder=place.processing.repair_encoder)
-        partial = product.with_name(f"{product.name}.partial")
-        create_product(partial, _layout(planned, place, scan, key))
-        partial.rename(product)
-    motion = planned.calibration.calibration.motion
-    n, covariance = tuple(motion.n.tolist()), tuple(map(tuple, motion.covariance.tolist()))
-    files, store = _files(planned, place), str(depth) if depth else None
-    count = -(-planned.grid.rows // planned.correction.strip_rows)
-    work = [
-        CorrectStrip(files, number, store, str(product), n, covariance, planned.correction) for number in range(count)
-    ]
-    return _missing(planned, place, "product", key, work)
+    def _correcting(self) -> list[Task]:
+        if self._is_renamed():
+            return []
+        planned, working = self.planned, Path(self._product.working)
+        if not working.is_dir():
+            check_own(Path(self._product.final), planned, self._row.input_sha256)
+            self._place.ledger.forget_strips(planned.key, "product")
+            partial = working.with_name(f"{working.name}.partial")
+            with naming_full_disk(self._product.final):
+                self._work.mkdir(parents=True, exist_ok=True)
+                layout = product_layout(planned, self._place.processing, self._row.input_sha256, self._strips_key)
+                create_product(partial, layout)
+                partial.rename(working)
+        motion = planned.calibration.calibration.motion
+        n, covariance = tuple(motion.n.tolist()), tuple(map(tuple, motion.covariance.tolist()))
+        store = str(self._depth_store) if self._depth_store else None
+        source = CorrectionInput(
+            planned.files, store, self._place.processing.disparity, n, covariance, planned.correction
+        )
+        work = [CorrectStrip(source, number, self._product) for number in range(planned.product_strips)]
+        return self._missing("product", self._strips_key, work)
 
+    def _finishing(self) -> list[Task]:
+        if self._is_renamed():
+            return []
+        finish = FinishProduct(self._product, self._strips_key, self._measured_cells(), self._place.verify)
+        return [Task(self.planned.key, finish)]
 
-def _missing(planned: PlannedScan, place: Place, stage: Stage, key: str, work: Sequence[Work]) -> list[Task]:
-    done = place.ledger.done(planned.key, stage, key)
-    return [Task(planned.key, item, stage, number, key) for number, item in enumerate(work) if number not in done]
+    def _is_renamed(self) -> bool:
+        """Whether the product has its final name, be it since an earlier run that was ended before it recorded that."""
+        strips = self._place.ledger.finished_strips(self.planned.key, "product", self._strips_key)
+        if Path(self._product.working).is_dir() or len(strips) < self.planned.product_strips:
+            return False
+        return is_finished(self._product.final, self._strips_key)
 
+    def _missing(self, stage: Stage, key: str, work: Sequence[Work]) -> list[Task]:
+        finished = self._place.ledger.finished_strips(self.planned.key, stage, key)
+        return [
+            Task(self.planned.key, item, Strip(stage, number, key))
+            for number, item in enumerate(work)
+            if number not in finished
+        ]
 
-def _is_renamed(planned: PlannedScan, place: Place, product: Path, target: Path, key: str) -> bool:
-    """Whether an earlier run was ended between giving the product its name and saying so in the ledger."""
-    count = -(-planned.grid.rows // planned.correction.strip_rows)
-    if product.is_dir() or len(place.ledger.done(planned.key, "product", key)) < count:
-        return False
-    return is_finished(target, key)
+    def _measured_cells(self) -> int:
+        strips = self._place.ledger.finished_strips(self.planned.key, "product", self._strips_key)
+        return measured_cells(strips.values()).count
 
+    @property
+    def _row(self) -> ScanRow:
+        row = self._place.ledger.scan(self.planned.key)
+        return row if row is not None else ScanRow(self.planned.key, self.planned.files.path, "running")
 
-def _layout(planned: PlannedScan, place: Place, scan: Scan, key: str) -> ProductLayout:
-    motion, grid = planned.calibration.calibration.motion, planned.grid
-    return ProductLayout(
-        shape=(grid.rows, grid.columns),
-        pitch_mm=grid.pitch_mm,
-        origin_mm=(grid.origin_y_mm, grid.origin_x_mm),
-        channels=scan.left.shape[2],
-        dtype=scan.left.dtype,
-        chunk_rows=planned.correction.strip_rows,
-        metadata={
-            "scan": str(planned.path),
-            "version": __version__,
-            "n": motion.n.tolist(),
-            "height_datum_mm": ProductFrame(scan.rig, scan.travel, motion.n).height_datum_mm,
-            "attributes": dict(scan.attributes),
-            "calibration": str(planned.calibration.path),
-            "disparity": asdict(place.processing.disparity),
-            "correction": asdict(planned.correction),
-            "key": key,
-        },
-        uncertainty=planned.correction.uncertainty,
-    )
+    @property
+    def _work(self) -> Path:
+        return self._place.work / key_of(self.planned.key)[:16]
 
+    # What depends on the scan's hash is asked for only when that is known.
 
-def _files(planned: PlannedScan, place: Place) -> ScanFiles:
-    return ScanFiles(str(planned.path), planned.stamp, place.processing.repair_encoder)
+    @cached_property
+    def _depth_key(self) -> str:
+        processing = self._place.processing
+        return depth_key(self._row.input_sha256, processing.disparity, processing.with_sigma, __version__)
 
+    @cached_property
+    def _strips_key(self) -> str:
+        processing = self._place.processing
+        sha256, correction = self.planned.calibration.sha256, processing.correction
+        key = product_key(self._depth_key, sha256, correction, processing.repair_encoder)
+        return key_of(key, self.planned.correction.strip_rows)
 
-def _first_row(planned: PlannedScan, place: Place) -> ScanRow:
-    """The row of a scan that is being worked on; files that nobody touched keep their hash."""
-    known = place.ledger.scan(planned.key)
-    return ScanRow(
-        scan=planned.key,
-        path=str(planned.path),
-        status="running",
-        lines=planned.lines,
-        stamp=planned.stamp,
-        input_sha256=known.input_sha256 if known is not None and known.stamp == planned.stamp else "",
-        calibration=str(planned.calibration.path),
-        calibration_sha256=planned.calibration.sha256,
-        config_sha256=place.processing.sha256,
-        version=__version__,
-    )
+    @property
+    def _depth_store(self) -> Path | None:
+        """Where the matched depth is stored; None where none is."""
+        stored = self.planned.matched and self._place.keep_depth
+        return self._work / f"depth-{self._depth_key[:16]}" if stored else None
 
-
-def _last_row(row: ScanRow, planned: PlannedScan, place: Place, key: str) -> ScanRow:
-    strips = place.ledger.strips(planned.key)
-    measured = sum(strip.measured for strip in strips if strip.key == key)
-    return replace(
-        row,
-        status="done",
-        seconds=sum(strip.seconds for strip in strips),
-        measured=measured / (planned.grid.rows * planned.grid.columns),
-    )
+    @property
+    def _product(self) -> ProductPlace:
+        working = self._work / f"product-{self._strips_key[:16]}.zarr"
+        return ProductPlace(str(working), str(product_path(self._place.output, self.planned.key)))

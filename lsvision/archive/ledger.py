@@ -1,42 +1,51 @@
-"""The ledger of an output: a row a scan and a row a strip, in SQLite beside the products."""
+"""The ledger of an output, in SQLite beside the products: one row per scan, one row per strip."""
 
+import logging
 import sqlite3
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
-from lsvision.errors import FileFormatError
+from lsvision.errors import FileFormatError, WriteError
+from lsvision.io import MeasuredCells
 
 LEDGER_FILE = "ledger.sqlite"
 
+_VERSION = 2  # of the tables; version 1 recorded none
 _WAIT_SECONDS = 5.0
 
 Stage = Literal["disparity", "product"]
 Status = Literal["running", "done", "failed"]
 
-_SCHEMA = """
-CREATE TABLE IF NOT EXISTS scans (
-    scan TEXT PRIMARY KEY, path TEXT NOT NULL, status TEXT NOT NULL, error TEXT NOT NULL, lines INTEGER NOT NULL,
-    seconds REAL NOT NULL, measured REAL NOT NULL, stamp TEXT NOT NULL, input_sha256 TEXT NOT NULL,
-    calibration TEXT NOT NULL, calibration_sha256 TEXT NOT NULL, config_sha256 TEXT NOT NULL, version TEXT NOT NULL
-);
-CREATE TABLE IF NOT EXISTS strips (
-    scan TEXT NOT NULL, stage TEXT NOT NULL, number INTEGER NOT NULL, key TEXT NOT NULL, status TEXT NOT NULL,
-    error TEXT NOT NULL, lines INTEGER NOT NULL, seconds REAL NOT NULL, measured INTEGER NOT NULL,
-    runs INTEGER NOT NULL,
-    PRIMARY KEY (scan, stage, number)
-);
-"""
+_TABLES = (
+    """
+    CREATE TABLE scans (
+        scan TEXT PRIMARY KEY, path TEXT NOT NULL, status TEXT NOT NULL, error TEXT NOT NULL, lines INTEGER NOT NULL,
+        seconds REAL NOT NULL, measured_share REAL NOT NULL, stamp TEXT NOT NULL, input_sha256 TEXT NOT NULL,
+        calibration TEXT NOT NULL, calibration_sha256 TEXT NOT NULL, config_sha256 TEXT NOT NULL, version TEXT NOT NULL
+    )
+    """,
+    """
+    CREATE TABLE strips (
+        scan TEXT NOT NULL, stage TEXT NOT NULL, number INTEGER NOT NULL, key TEXT NOT NULL, status TEXT NOT NULL,
+        error TEXT NOT NULL, lines INTEGER NOT NULL, seconds REAL NOT NULL, measured_cells INTEGER NOT NULL,
+        lowest_mm REAL NOT NULL, highest_mm REAL NOT NULL, runs INTEGER NOT NULL,
+        PRIMARY KEY (scan, stage, number)
+    )
+    """,
+)
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
 class ScanRow:
     """What is known of a scan.
 
-    ``stamp`` tells cheaply whether its files were touched (paths, sizes, times), ``input_sha256`` what is in them.
-    ``seconds`` were worked on it over all strips, ``measured`` is the share of the product's cells with a height.
+    ``stamp`` changes when its files are touched (paths, sizes, times), ``input_sha256`` when their content changes.
+    ``seconds`` is the work on all its strips, ``measured_share`` the share of the product's cells with a height.
     """
 
     scan: str
@@ -45,7 +54,7 @@ class ScanRow:
     error: str = ""
     lines: int = 0
     seconds: float = 0.0
-    measured: float = 0.0
+    measured_share: float = 0.0
     stamp: str = ""
     input_sha256: str = ""
     calibration: str = ""
@@ -56,9 +65,11 @@ class ScanRow:
 
 @dataclass(frozen=True)
 class StripRow:
-    """One strip of one stage of a scan: done for ``key``, the hash of all that it depends on, or failed.
+    """One strip of one stage of a scan: finished for ``key``, the hash of everything it depends on, or failed.
 
-    ``measured`` counts the cells with a value, ``runs`` how often the strip was done for this key.
+    ``lines`` are those of the scan, or rows of the product. ``measured_cells`` of them have a depth, or a height;
+    ``lowest_mm`` and ``highest_mm`` are the range of the heights. ``runs`` counts how often it was finished for its
+    key.
     """
 
     scan: str
@@ -69,25 +80,33 @@ class StripRow:
     error: str = ""
     lines: int = 0
     seconds: float = 0.0
-    measured: int = 0
+    measured_cells: int = 0
+    lowest_mm: float = MeasuredCells.lowest_mm
+    highest_mm: float = MeasuredCells.highest_mm
     runs: int = 1
 
 
 class Ledger:
     """The open ledger; every call that writes is one transaction. One process writes, any number may read.
 
+    A ledger of an earlier version is emptied: what it recorded was made by an earlier version and is made again.
+
     Raises:
-        FileFormatError: the file is there and is no ledger.
+        FileFormatError: the file is no ledger, or one of a later version.
+        WriteError: by every call that writes, when the disk is full.
     """
 
     def __init__(self, path: Path) -> None:
+        self._path = path
         try:
             self._db = sqlite3.connect(path, isolation_level=None)
             self._db.row_factory = sqlite3.Row
             _log_ahead(self._db)
             self._db.execute("PRAGMA synchronous=NORMAL")
-            self._db.executescript(_SCHEMA)
+            self._create_tables()
         except sqlite3.DatabaseError as error:
+            if _is_full(error):
+                raise self._full() from error
             raise FileFormatError(path, f"not a ledger: {error}") from error
 
     def __enter__(self) -> "Ledger":
@@ -112,8 +131,8 @@ class Ledger:
         rows = self._db.execute(f"SELECT * FROM strips {chosen} ORDER BY scan, stage, number", values)
         return [StripRow(**dict(row)) for row in rows]
 
-    def done(self, scan: str, stage: Stage, key: str) -> dict[int, StripRow]:
-        """The strips of a stage that are done for a key, by number."""
+    def finished_strips(self, scan: str, stage: Stage, key: str) -> dict[int, StripRow]:
+        """The strips of a stage that are finished for a key, by number."""
         return {
             strip.number: strip
             for strip in self.strips(scan)
@@ -121,34 +140,76 @@ class Ledger:
         }
 
     def put_scan(self, row: ScanRow) -> None:
-        """Write a scan's row; one that says the same already is left alone."""
+        """Write a scan's row, unless the ledger holds the same already."""
         if self.scan(row.scan) != row:
-            self._db.execute(_upsert("scans", ScanRow), asdict(row))
+            self._write(_upsert("scans", ScanRow), asdict(row))
 
     def put_strip(self, row: StripRow) -> None:
-        """Write a strip's row; a strip that was done for the same key before counts one run more."""
+        """Write a strip's row; a strip that was finished for the same key before counts one run more."""
         again = "strips.key = excluded.key AND strips.status = 'done'"
         counted = f"runs = CASE WHEN {again} THEN strips.runs + 1 ELSE 1 END"
-        self._db.execute(_upsert("strips", StripRow).replace("runs = excluded.runs", counted), asdict(row))
+        self._write(_upsert("strips", StripRow).replace("runs = excluded.runs", counted), asdict(row))
 
     def forget_strips(self, scan: str, stage: Stage) -> None:
         """Drop the strips of a stage whose results are gone."""
-        self._db.execute("DELETE FROM strips WHERE scan = ? AND stage = ?", (scan, stage))
+        self._write("DELETE FROM strips WHERE scan = ? AND stage = ?", (scan, stage))
 
     def seconds_per_line(self) -> Mapping[str, float]:
-        """Mean time that a line took in each stage, over everything done so far."""
+        """Mean time of a line in each stage, over all finished strips."""
         rows = self._db.execute(
             "SELECT stage, SUM(seconds) / SUM(lines) FROM strips WHERE status = 'done' AND lines > 0 GROUP BY stage"
         )
         return {stage: float(seconds) for stage, seconds in rows}
 
+    def _create_tables(self) -> None:
+        """Create the tables where there are none of this version."""
+        if self._version() == _VERSION:
+            return
+        self._db.execute("BEGIN IMMEDIATE")  # of several that open it at once, one creates them
+        with self._db:
+            version = self._version()
+            if version > _VERSION:
+                raise FileFormatError(self._path, f"made by a later version: {version}, expected up to {_VERSION}")
+            if version < _VERSION:
+                old = self._db.execute("SELECT name FROM sqlite_master WHERE name IN ('scans', 'strips')").fetchall()
+                if old:
+                    log.warning("%s is of an earlier version and starts anew: its scans are made again", self._path)
+                for (name,) in old:
+                    self._db.execute(f"DROP TABLE {name}")
+                for table in _TABLES:
+                    self._db.execute(table)
+                self._db.execute(f"PRAGMA user_version = {_VERSION}")
+
+    def _version(self) -> int:
+        return int(self._db.execute("PRAGMA user_version").fetchone()[0])
+
+    def _write(self, statement: str, values: Mapping[str, Any] | tuple[Any, ...]) -> None:
+        try:
+            self._db.execute(statement, values)
+        except sqlite3.OperationalError as error:
+            if _is_full(error):
+                raise self._full() from error
+            raise
+
+    def _full(self) -> WriteError:
+        return WriteError(f"{self._path}: cannot be written: the disk is full")
+
+
+def measured_cells(strips: Iterable[StripRow]) -> MeasuredCells:
+    """The measured cells of a product by its strips."""
+    return MeasuredCells.total(
+        MeasuredCells(strip.measured_cells, strip.lowest_mm, strip.highest_mm) for strip in strips
+    )
+
 
 def ledger_lines(rows: Mapping[str, ScanRow]) -> Iterator[str]:
-    """The ledger in words, a line a scan."""
+    """The ledger in words, one line per scan."""
     width = max((len(key) for key in rows), default=0)
     for key, row in rows.items():
-        told = row.error if row.status == "failed" else f"{row.lines} lines, {100 * row.measured:.1f} % measured"
-        yield f"{key:{width}}  {row.status:7}  {row.seconds:8.1f} s  {told}"
+        result = (
+            row.error if row.status == "failed" else f"{row.lines} lines, {100 * row.measured_share:.1f} % measured"
+        )
+        yield f"{key:{width}}  {row.status:7}  {row.seconds:8.1f} s  {result}"
 
 
 def _upsert(table: str, schema: type) -> str:
@@ -156,6 +217,10 @@ def _upsert(table: str, schema: type) -> str:
     changes = ", ".join(f"{name} = excluded.{name}" for name in names)
     values = ", ".join(f":{name}" for name in names)
     return f"INSERT INTO {table} ({', '.join(names)}) VALUES ({values}) ON CONFLICT DO UPDATE SET {changes}"
+
+
+def _is_full(error: sqlite3.DatabaseError) -> bool:
+    return getattr(error, "sqlite_errorcode", None) == sqlite3.SQLITE_FULL
 
 
 def _log_ahead(db: sqlite3.Connection) -> None:

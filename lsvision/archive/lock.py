@@ -1,30 +1,40 @@
 """One run at a time on an output."""
 
-import fcntl
-import os
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 from lsvision.errors import ConfigError
 
+with warnings.catch_warnings():
+    # Where the system cannot lock a file, filelock warns and takes the file's presence for the lock.
+    warnings.filterwarnings("ignore", message="only soft file lock is available")
+    from filelock import FileLock, Timeout
+
 LOCK_FILE = ".lock"
 
 
 @contextmanager
-def sole_run(output: Path) -> Iterator[None]:
-    """Hold an output while the block runs; the lock goes with the process, however that ends.
+def sole_run(output: Path, lock_file: Path | None = None) -> Iterator[None]:
+    """Hold an output, or the part of it that a lock file stands for, while the block runs.
+
+    The lock goes with the process, however that ends.
+
+    Args:
+        lock_file: ``.lock`` in the output where it is None.
 
     Raises:
         ConfigError: another run holds it.
     """
-    output.mkdir(parents=True, exist_ok=True)
-    descriptor = os.open(output / LOCK_FILE, os.O_RDWR | os.O_CREAT, 0o644)
+    path = lock_file or output / LOCK_FILE
+    path.parent.mkdir(parents=True, exist_ok=True)
+    lock = FileLock(path)
     try:
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            raise ConfigError(f"output: another run is working on {output}; wait for it or choose another") from None
+        lock.acquire(blocking=False)
+    except Timeout:
+        raise ConfigError(f"output: another run is working on {output}; wait for it or choose another") from None
+    try:
         yield
     finally:
-        os.close(descriptor)
+        lock.release()

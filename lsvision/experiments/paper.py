@@ -11,7 +11,8 @@ from typing import Annotated
 
 from annotated_types import MinLen
 
-from lsvision.experiments.correct import write_product
+from lsvision.archive import Processing, plan_one
+from lsvision.experiments.correct import make_product
 from lsvision.experiments.parallel import map_names, scan_pool
 from lsvision.experiments.settings import RunSettings
 from lsvision.experiments.simulate import write_simulation
@@ -39,7 +40,7 @@ from lsvision.stages.correction.config import CorrectionConfig
 from lsvision.stages.disparity.config import DisparityConfig
 from lsvision.stages.disparity.depth import depth_of
 from lsvision.stages.measurement import distance_errors, measure_board
-from lsvision.types import Board, BoardCorners, ProductGrid, Rig, Scan, TensorImage
+from lsvision.types import Board, BoardCorners, Rig, Scan, TensorImage
 
 log = logging.getLogger(__name__)
 
@@ -104,22 +105,24 @@ def _scenario(settings: PaperSettings, motion: MotionConfig, folder: Path, bars:
         write_calibration(joint, folder / "calibration_joint.json")
         write_calibration(two_step, folder / "calibration_two_step.json")
 
+        processing = Processing(settings.disparity, settings.correction, repair_encoder=False, worker_memory_mb=None)
+
         def corrected(name: str) -> Product:
-            target = folder / f"{name}.zarr"
-            write_product(scans[name], joint.motion, settings.disparity, settings.correction, target, bars)
-            return read_product(target)
+            planned = plan_one(folder / name, folder / "calibration_joint.json", processing)
+            return read_product(make_product(planned, processing, folder, bars).path)
 
         products = map_names(pool, corrected, scans)
         checks = map_names(pool, lambda name: _check_board(settings.board, corners[name], products[name]), boards)
-    sheet = simulations["sheet"]
-    color, height, grid = _in_memory(products["sheet"])
+    sheet, product = simulations["sheet"], products["sheet"]
+    strip = product.read(0, product.grid.rows)
+    color, height = TensorImage(strip.color), TensorImage(strip.height[..., None])
     return Scenario(
         n_true=sheet.trajectory.n,
         results={"joint": joint, "two_step": two_step},
         boards=corners,
         checks=checks,
         sheet_before=points_in_scan(scans["sheet"], depth_of(scans["sheet"], settings.disparity), sheet),
-        sheet_after=points_in_product(color, height, grid, joint.motion.n, sheet),
+        sheet_after=points_in_product(color, height, product.grid, joint.motion.n, sheet),
         scans=scans,
         products=products,
     )
@@ -150,7 +153,9 @@ def _check_board(board: Board, corners: BoardCorners, product: Product) -> Board
     """Distances between a board's corners at nominal motion and in the product."""
     nominal = displace(corners.points, corners.points.new_tensor([0.0, 1.0, 0.0]))
     neighbours_mm, pairs_mm = distance_errors(nominal, board, corners.valid)
-    measured = measure_board(*_in_memory(product), board)
+    strip = product.read(0, product.grid.rows)
+    color, height = TensorImage(strip.color), TensorImage(strip.height[..., None])
+    measured = measure_board(color, height, product.grid, board)
     if measured is None:
         return BoardCheck(0, neighbours_mm, pairs_mm)
     return BoardCheck(
@@ -161,11 +166,3 @@ def _check_board(board: Board, corners: BoardCorners, product: Product) -> Board
         pairs_after_mm=measured.distance_rms_mm,
         points=measured.points,
     )
-
-
-def _in_memory(product: Product) -> tuple[TensorImage, TensorImage, ProductGrid]:
-    rows, columns = product.shape
-    color, height = product.color(0, rows), product.height(0, rows)
-    origin_y, origin_x = product.origin_mm
-    grid = ProductGrid(rows, columns, product.pitch_mm, origin_y, origin_x)
-    return TensorImage(color), TensorImage(height[..., None]), grid

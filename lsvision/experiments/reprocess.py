@@ -2,35 +2,37 @@
 
 import logging
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from lsvision.archive import (
     LEDGER_FILE,
+    WORK_FOLDER,
     Engine,
     EngineConfig,
     Ledger,
     LocalEngine,
+    Outcome,
     Place,
     Plan,
+    PlannedScan,
     Processing,
     ScanRow,
+    Task,
+    damaged_products,
     find_scans,
     ledger_lines,
     local_archive,
     plan_run,
     predicted_bytes,
     predicted_seconds,
+    process_scans,
+    product_rows,
     read_calibrations,
-    run_jobs,
-    scan_job,
     sole_run,
-    verify_job,
     worker_count,
 )
-from lsvision.archive.job import WORK_FOLDER, Job
-from lsvision.archive.tasks import Task, TaskResult
 from lsvision.errors import ConfigError, ScansFailedError
 from lsvision.experiments.settings import RunSettings
 from lsvision.report.archive_pages import reprocess_report
@@ -66,47 +68,47 @@ class StatusSettings(RunSettings):
 
 
 def run_reprocess(settings: ReprocessSettings, folder: Path) -> None:
-    """Find, plan, work through, report.
+    """Find, plan, process, report.
 
     Raises:
         ScansFailedError: some scans failed; the others are done.
     """
     output = Path(settings.output).absolute()
     if settings.dry_run:
-        known = _known(output)
-        _tell(_plan(settings, output, known[0]), known[1], settings.engine)
+        known, seconds_per_line = _read_ledger(output)
+        _log_plan(_plan(settings, output, known), seconds_per_line, settings.engine)
         return
     with sole_run(output), Ledger(output / LEDGER_FILE) as ledger:
         plan = _plan(settings, output, ledger.scans())
-        _tell(plan, ledger.seconds_per_line(), settings.engine)
+        _log_plan(plan, ledger.seconds_per_line(), settings.engine)
         begin = time.perf_counter()
-        place = Place(ledger, output, _processing(settings), settings.verify)
-        done = _work(settings, plan, place)
+        place = Place(ledger, output, output / WORK_FOLDER, _processing(settings), verify=settings.verify)
+        processed = _process(settings, plan, place)
         for found, problem in plan.faulty.items():
             ledger.put_scan(ScanRow(found.key, str(found.path), "failed", error=problem))
         seconds = time.perf_counter() - begin
         keys = {scan.key for scan in (*plan.to_do, *plan.unchanged)} | {found.key for found in plan.faulty}
         rows = {key: row for key, row in ledger.scans().items() if key in keys}
     failed = {key: row for key, row in rows.items() if row.status == "failed"}
-    reprocess_report(rows, done, output, seconds, asdict(settings), folder)
+    reprocess_report(rows, processed, output, seconds, asdict(settings), folder)
     for line in ledger_lines(failed):
         log.info("%s", line)
-    log.info("%d done, %d unchanged, %d failed, in %.1f s", sum(row.status == "done" for row in done),
-             len(plan.unchanged), len(failed), seconds)  # fmt: skip
+    done = sum(row.status == "done" for row in processed)
+    log.info("%d done, %d unchanged, %d failed, in %.1f s", done, len(rows) - done - len(failed), len(failed), seconds)
     if failed:
         raise ScansFailedError(len(failed), len(rows), str(output / LEDGER_FILE))
 
 
 def run_status(settings: StatusSettings, folder: Path) -> None:
     """Print the ledger of an output."""
-    rows, _ = _known(Path(settings.output))
+    rows, _ = _read_ledger(Path(settings.output))
     if not rows:
         raise ConfigError(f"output: no ledger in {settings.output}")
     for line in ledger_lines(rows):
         log.info("%s", line)
 
 
-def _plan(settings: ReprocessSettings, output: Path, known: dict[str, ScanRow]) -> Plan:
+def _plan(settings: ReprocessSettings, output: Path, known: Mapping[str, ScanRow]) -> Plan:
     calibrations = read_calibrations(settings.calibration)
     found = find_scans(local_archive(settings.archive, output / WORK_FOLDER / "copies"), skip=output)
     if not found:
@@ -120,16 +122,16 @@ def _processing(settings: ReprocessSettings) -> Processing:
     )
 
 
-def _known(output: Path) -> tuple[dict[str, ScanRow], dict[str, float]]:
-    """Scans of a ledger and what a line took, without making one where there is none."""
+def _read_ledger(output: Path) -> tuple[Mapping[str, ScanRow], Mapping[str, float]]:
+    """Scans of a ledger and the mean time of a line in each stage; no ledger is created."""
     if not (output / LEDGER_FILE).is_file():
         return {}, {}
     with Ledger(output / LEDGER_FILE) as ledger:
-        return ledger.scans(), dict(ledger.seconds_per_line())
+        return ledger.scans(), ledger.seconds_per_line()
 
 
-def _tell(plan: Plan, seconds_per_line: Mapping[str, float], engine: EngineConfig) -> None:
-    """Say what was found before anything starts."""
+def _log_plan(plan: Plan, seconds_per_line: Mapping[str, float], engine: EngineConfig) -> None:
+    """Log what was found before anything starts."""
     log.info(
         "%d scans to do with %d lines, %d unchanged, %d that cannot be read",
         len(plan.to_do), sum(scan.lines for scan in plan.to_do), len(plan.unchanged), len(plan.faulty),
@@ -144,26 +146,25 @@ def _tell(plan: Plan, seconds_per_line: Mapping[str, float], engine: EngineConfi
         )  # fmt: skip
 
 
-def _work(settings: ReprocessSettings, plan: Plan, place: Place) -> list[ScanRow]:
-    """Take all jobs to their end under one bar over all lines."""
-    checked = plan.unchanged if settings.verify else []
-    if not plan.to_do and not checked:
+def _process(settings: ReprocessSettings, plan: Plan, place: Place) -> list[ScanRow]:
+    """Process the planned scans, and those whose products turn out to be damaged where they are verified."""
+    verified = plan.unchanged if settings.verify else []
+    if not plan.to_do and not verified:
         return []
+    with _engine(settings.engine) as engine:
+        return _process_with(engine, [*plan.to_do, *damaged_products(verified, engine, place)], place)
 
-    def jobs() -> Iterator[tuple[str, Job]]:
-        yield from ((scan.key, scan_job(scan, place)) for scan in plan.to_do)
-        yield from ((scan.key, verify_job(scan, place)) for scan in checked)
 
-    # A line counts when its row of the product is there.
-    share = {scan.key: scan.lines / scan.grid.rows for scan in plan.to_do}
-    with _engine(settings.engine) as engine, progress_bars() as bars:
-        bar = bars.start("reprocess", total=sum(scan.lines for scan in plan.to_do))
+def _process_with(engine: Engine, scans: list[PlannedScan], place: Place) -> list[ScanRow]:
+    """Process scans under one bar over all their lines; a line counts when its row of the product is there."""
+    lines_per_row = {scan.key: scan.lines / scan.grid.rows for scan in scans}
+    with progress_bars() as bars:
+        bar = bars.start("reprocess", total=sum(scan.lines for scan in scans))
 
-        def advance(task: Task, result: TaskResult) -> None:
-            if task.stage == "product" and result.error is None:
-                bars.advance(bar, result.lines * share.get(task.scan, 0.0))
+        def advance(task: Task, outcome: Outcome) -> None:
+            bars.advance(bar, product_rows(task, outcome) * lines_per_row[task.scan])
 
-        return run_jobs(jobs(), engine, place, advance)
+        return process_scans(scans, engine, place, advance)
 
 
 def _engine(config: EngineConfig) -> Engine:

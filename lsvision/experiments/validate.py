@@ -4,14 +4,11 @@ import logging
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-import torch
-from torch import Tensor
-
 from lsvision.experiments.settings import RunSettings
-from lsvision.io import Product, check_product, read_product, write_json
+from lsvision.io import ProductImage, check_product, read_product, write_json
 from lsvision.schema import Text
 from lsvision.stages.measurement import measure_board
-from lsvision.types import Board, ProductGrid
+from lsvision.types import Board
 
 log = logging.getLogger(__name__)
 
@@ -24,31 +21,8 @@ class ValidateSettings(RunSettings):
     board: Board
 
 
-@dataclass(frozen=True)
-class ProductImage:
-    """One image of a product on disk, as a ``LineImage``."""
-
-    product: Product
-    name: str
-
-    @property
-    def shape(self) -> tuple[int, int, int]:
-        """(rows, columns, channels)."""
-        return *self.product.shape, self.read(0, 0).shape[2]
-
-    @property
-    def dtype(self) -> torch.dtype:
-        """That of the image."""
-        return self.read(0, 0).dtype
-
-    def read(self, start: int, stop: int) -> Tensor:
-        """Rows ``start..stop-1``."""
-        block: Tensor = getattr(self.product, self.name)(start, stop)
-        return block if block.ndim == 3 else block[..., None]
-
-
 def run_validate(settings: ValidateSettings, folder: Path) -> None:
-    """Check the product and say what is in it; a fault ends the run with the image and the rows at fault."""
+    """Check the product, log what is in it and measure its board; a fault is an error that names the image and rows."""
     check = check_product(settings.product)
     product = read_product(settings.product)
     log.info(
@@ -56,8 +30,8 @@ def run_validate(settings: ValidateSettings, folder: Path) -> None:
         settings.product, check.rows, check.columns, check.levels, 100 * check.valid_share,
         check.lowest_mm, check.highest_mm,
     )  # fmt: skip
-    grid = ProductGrid(*product.shape, product.pitch_mm, *product.origin_mm)
-    board = measure_board(ProductImage(product, "color"), ProductImage(product, "height"), grid, settings.board)
+    color, height = ProductImage(product, "color"), ProductImage(product, "height")
+    board = measure_board(color, height, product.grid, settings.board)
     summary: dict[str, object] = asdict(check)
     if board is None:
         log.info("no board of %d x %d squares in it", settings.board.columns, settings.board.rows)

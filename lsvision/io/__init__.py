@@ -1,6 +1,6 @@
 """Files: rig, scan, calibration and product; read by line ranges, checked on reading, complete under a final name."""
 
-from lsvision.io.atomic import remove_left_over, write_text
+from lsvision.io.atomic import naming_full_disk, remove_partial_siblings, write_text
 from lsvision.io.formats.calibration import check_rig_match, read_calibration, write_calibration
 from lsvision.io.formats.checksum import scan_sha256
 from lsvision.io.formats.encoder import read_encoder, write_encoder
@@ -12,31 +12,36 @@ from lsvision.io.json_file import finite_or_null, write_json
 from lsvision.io.product.check import ProductCheck, check_product
 from lsvision.io.product.export import ExportFormat, export_product
 from lsvision.io.product.las import write_laz
+from lsvision.io.product.layout import ProductLayout
+from lsvision.io.product.measured import MeasuredCells
 from lsvision.io.product.ply import write_ply
-from lsvision.io.product.reader import Product, read_product
-from lsvision.io.product.writer import ProductLayout, ProductRows, ProductWriter, complete_product, create_product
+from lsvision.io.product.reader import Product, ProductImage, read_product
+from lsvision.io.product.writer import ProductRows, complete_product, create_product, product_writer
 
 __all__ = [
     "ExportFormat",
+    "MeasuredCells",
     "NewScan",
     "Product",
     "ProductCheck",
+    "ProductImage",
     "ProductLayout",
     "ProductRows",
-    "ProductWriter",
     "check_product",
     "check_rig_match",
     "complete_product",
     "create_product",
     "export_product",
     "finite_or_null",
+    "naming_full_disk",
     "open_line_image",
+    "product_writer",
     "read_calibration",
     "read_encoder",
     "read_product",
     "read_rig",
     "read_scan",
-    "remove_left_over",
+    "remove_partial_siblings",
     "rig_from_dict",
     "rig_to_dict",
     "scan_files",

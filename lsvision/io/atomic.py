@@ -11,6 +11,19 @@ from pathlib import Path
 
 from lsvision.errors import FileFormatError, WriteError
 
+_FULL = (errno.ENOSPC, getattr(errno, "EDQUOT", errno.ENOSPC))  # no quotas on some platforms
+
+
+@contextmanager
+def naming_full_disk(target: Path | str) -> Iterator[None]:
+    """Raise a ``WriteError`` that names ``target`` where the disk is full: the system's own error names nothing."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno is not None and error.errno in _FULL:
+            raise WriteError(f"{target}: cannot be written: {os.strerror(error.errno)}") from error
+        raise
+
 
 @contextmanager
 def partial_file(target: Path | str) -> Iterator[Path]:
@@ -23,11 +36,9 @@ def partial_file(target: Path | str) -> Iterator[Path]:
     target.parent.mkdir(parents=True, exist_ok=True)
     partial = _hidden_sibling(target)
     try:
-        yield partial
-        partial.replace(target)
-    except OSError as error:
-        _tell_full_disk(target, error)
-        raise
+        with naming_full_disk(target):
+            yield partial
+            partial.replace(target)
     finally:
         partial.unlink(missing_ok=True)
 
@@ -38,7 +49,7 @@ def partial_folder(target: Path | str, *, marker: str) -> Iterator[Path]:
 
     Args:
         target: final folder. An existing one is replaced only where nothing else can be lost by it.
-        marker: file name that tells a folder of this kind, and so one that may be replaced.
+        marker: name of a file that every folder of this kind holds; only such a folder is replaced.
 
     Raises:
         FileFormatError: ``target`` exists, is not empty and does not hold ``marker``.
@@ -50,11 +61,9 @@ def partial_folder(target: Path | str, *, marker: str) -> Iterator[Path]:
     partial = _hidden_sibling(target)
     partial.mkdir()
     try:
-        yield partial
-        _take_over(partial, target)
-    except OSError as error:
-        _tell_full_disk(target, error)
-        raise
+        with naming_full_disk(target):
+            yield partial
+            _take_over(partial, target)
     finally:
         shutil.rmtree(partial, ignore_errors=True)
 
@@ -71,22 +80,17 @@ def replace_folder(source: Path | str, target: Path | str, *, marker: str) -> No
     _take_over(Path(source), target)
 
 
-def remove_left_over(target: Path | str) -> None:
-    """Remove what killed writers of ``target`` left beside it; for the only one who writes it now."""
+def remove_partial_siblings(target: Path | str) -> None:
+    """Remove the partial results of killed writers beside ``target``; no other process may be writing it."""
     target = Path(target).resolve()
-    for left_over in target.parent.glob(f".{glob.escape(target.name)}.*.partial"):
-        shutil.rmtree(left_over, ignore_errors=True)
+    for partial in target.parent.glob(f".{glob.escape(target.name)}.*.partial"):
+        shutil.rmtree(partial, ignore_errors=True)
 
 
 def write_text(path: Path | str, text: str) -> None:
     """Write a text file, UTF-8, in one step."""
     with partial_file(path) as partial:
         partial.write_text(text, encoding="utf-8")
-
-
-def _tell_full_disk(target: Path, error: OSError) -> None:
-    if error.errno in (errno.ENOSPC, errno.EDQUOT):
-        raise WriteError(f"{target}: cannot be written: {os.strerror(error.errno)}") from error
 
 
 def _hidden_sibling(target: Path) -> Path:

@@ -8,22 +8,27 @@ from lsvision.io import read_product
 from lsvision.report import Headline, Page, ReportFigure, Table, write_report
 from lsvision.report.drawing import new_figure, show_image, thinned
 
-_MOST_THUMBNAILS = 24
-_ACROSS = 6
+_MAX_THUMBNAILS = 24
+_THUMBNAILS_ACROSS = 6
 _ROWS = 1024
 
 
 def reprocess_report(
-    rows: Mapping[str, ScanRow], done: Sequence[ScanRow], output: Path, seconds: float, settings: dict, folder: Path
+    rows: Mapping[str, ScanRow],
+    processed: Sequence[ScanRow],
+    output: Path,
+    seconds: float,
+    settings: dict,
+    folder: Path,
 ) -> None:
-    """``report.html`` of a run: every scan of the archive, why some failed, and a look at what this run made.
+    """``report.html`` of a run: every scan of the archive, why some failed, and the first products that it made.
 
     Args:
         rows: of all scans, as the ledger has them.
-        done: rows of those that this run worked on.
+        processed: rows of those that this run processed.
     """
     failed = [row for row in rows.values() if row.status == "failed"]
-    made = [row for row in done if row.status == "done"]
+    made = [row for row in processed if row.status == "done"]
     lines = sum(row.lines for row in made)
     page = Page(
         title=f"Archive of {len(rows)} scans",
@@ -32,7 +37,7 @@ def reprocess_report(
         headlines=[
             Headline("Done", str(len(made)), "by this run"),
             Headline("Failed", str(len(failed)), f"of {len(rows)} scans"),
-            Headline("Lines", str(lines), f"in {seconds:.1f} s: {lines / max(seconds, 1e-9):.0f} lines a second"),
+            Headline("Lines", str(lines), f"in {seconds:.1f} s: {lines / max(seconds, 1e-9):.0f} lines per second"),
         ],
         tables=[
             Table("Failed scans", ("scan", "reason"), [(row.scan, row.error) for row in failed]),
@@ -40,7 +45,7 @@ def reprocess_report(
                 "Scans",
                 ("scan", "status", "lines", "measured [%]", "work [s]", "calibration"),
                 [
-                    (row.scan, row.status, str(row.lines), f"{100 * row.measured:.1f}", f"{row.seconds:.1f}",
+                    (row.scan, row.status, str(row.lines), f"{100 * row.measured_share:.1f}", f"{row.seconds:.1f}",
                      Path(row.calibration).name)
                     for row in rows.values()
                 ],
@@ -53,8 +58,8 @@ def reprocess_report(
 
 
 def _thumbnails(made: Sequence[ScanRow], output: Path) -> ReportFigure:
-    shown = made[:_MOST_THUMBNAILS]
-    down, across = -(-len(shown) // _ACROSS), min(_ACROSS, len(shown))
+    shown = made[:_MAX_THUMBNAILS]
+    down, across = -(-len(shown) // _THUMBNAILS_ACROSS), min(_THUMBNAILS_ACROSS, len(shown))
     figure, axes = new_figure(1.9 * across, 2.1 * down, down, across, squeeze=False)
     for panel in axes:
         panel.set_axis_off()

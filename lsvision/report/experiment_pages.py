@@ -19,7 +19,7 @@ from lsvision.report.space_figures import corners_in_space, surface_in_space
 from lsvision.report.summary import calibration_summary
 from lsvision.types import BoardCorners, Calibration
 
-_PROVENANCE = ("scan", "calibration", "config_sha256")  # of a product's metadata
+_PROVENANCE = ("scan", "calibration", "calibration_sha256", "key")  # of a product's metadata
 _SHOWN_ROWS = 4000  # of a product, from its start: they fit in memory however long the scan is
 
 

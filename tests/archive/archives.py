@@ -8,6 +8,7 @@ import torch
 
 from lsvision.archive import (
     LEDGER_FILE,
+    WORK_FOLDER,
     Engine,
     Ledger,
     LocalEngine,
@@ -16,9 +17,8 @@ from lsvision.archive import (
     ScanRow,
     find_scans,
     plan_run,
+    process_scans,
     read_calibrations,
-    run_jobs,
-    scan_job,
 )
 from lsvision.geometry import zero_disparity_mm
 from lsvision.io import NewScan, read_product, write_calibration, write_scan
@@ -64,7 +64,7 @@ def make_calibration(path: Path, n: Sequence[float] = (0.02, 1.02, -0.01), rig: 
 
 
 class InProcess:
-    """An engine that runs every task at once where it stands, last one first, and counts them."""
+    """An engine that runs tasks in this process, the last one first, and counts them."""
 
     def __init__(self, capacity: int = 4) -> None:
         self.capacity = capacity
@@ -94,19 +94,18 @@ def process(
     output: Path,
     engine: Engine | None = None,
     processing: Processing = PROCESSING,
-    on_done: Callable = lambda task, result: None,
+    on_done: Callable = lambda task, outcome: None,
     verify: bool = False,
 ) -> tuple[list[ScanRow], Engine]:
-    """Work through an archive with an engine, and say what was done."""
+    """Process an archive with an engine; returns the rows of the processed scans and the engine."""
     output.mkdir(exist_ok=True)
     with Ledger(output / LEDGER_FILE) as ledger:
         plan = plan_run(
             find_scans(str(archive), output), read_calibrations(calibration), processing, ledger.scans(), output
         )
-        place = Place(ledger, output, processing, verify)
-        jobs = [(scan.key, scan_job(scan, place)) for scan in plan.to_do]
+        place = Place(ledger, output, output / WORK_FOLDER, processing, verify=verify)
         with engine or InProcess() as running:
-            return run_jobs(jobs, running, place, on_done), running
+            return process_scans(plan.to_do, running, place, on_done), running
 
 
 def with_strip_rows(rows: int) -> Processing:

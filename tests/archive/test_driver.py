@@ -1,4 +1,4 @@
-"""An archive worked through: the same bits whatever the engine, the workers and the strips, and nothing done twice."""
+"""An archive processed: the same bits whatever the engine, the workers and the strips, and nothing done twice."""
 
 import json
 import shutil
@@ -10,7 +10,8 @@ import torch
 import zarr
 
 from lsvision.archive import LEDGER_FILE, Ledger
-from lsvision.archive.tasks import CorrectStrip, HashInput, MatchStrip, run_task
+from lsvision.archive.tasks import run_task
+from lsvision.archive.work import CorrectStrip, HashInput, MatchStrip
 from lsvision.io import read_calibration, read_product, read_scan
 from lsvision.stages.correction.correct import correct_scan
 from lsvision.stages.disparity.depth import depth_of
@@ -53,7 +54,9 @@ def test_a_product_is_that_of_the_bare_stages(archive, calibration, undisturbed,
         assert getattr(product, plane)(0, product.shape[0]).numpy().tobytes() == expected.numpy().tobytes()
     with Ledger(undisturbed / LEDGER_FILE) as ledger:
         row = ledger.scans()[name]
-    assert row.measured == pytest.approx(sum(int(s.valid.sum()) for s in strips) / sum(s.valid.numel() for s in strips))
+    assert row.measured_share == pytest.approx(
+        sum(int(s.valid.sum()) for s in strips) / sum(s.valid.numel() for s in strips)
+    )
 
 
 def test_two_workers_make_the_same_products(archive, calibration, undisturbed, tmp_path):
@@ -75,7 +78,7 @@ def test_uncertainty_is_that_of_the_bare_stages(archive, calibration, tmp_path):
 
 def test_tasks_that_run_twice_do_no_harm(archive, calibration, undisturbed, tmp_path):
     class Twice(InProcess):
-        """The first worker at every task dies before it can say what it did."""
+        """The first worker at every task crashes before its outcome is known."""
 
         def collect(self):
             run_task(self._waiting[-1])
@@ -164,7 +167,7 @@ def test_a_run_that_was_ended_goes_on_where_it_stood(archive, calibration, undis
 
     counted = iter(range(ended_after))
 
-    def end(task, result):
+    def end(task, outcome):
         if next(counted, None) is None:
             raise EndError
 
@@ -173,7 +176,7 @@ def test_a_run_that_was_ended_goes_on_where_it_stood(archive, calibration, undis
     before = {(strip.scan, strip.stage, strip.number) for strip in strips_of(tmp_path / "o")}
     _, engine = process(archive, calibration, tmp_path / "o")
     assert_same_products(undisturbed, tmp_path / "o")
-    again = {(task.scan, task.stage, task.number) for task in engine.tasks if task.stage}
+    again = {(task.scan, task.strip.stage, task.strip.number) for task in engine.tasks if task.strip}
     assert not again & before
     assert all(strip.runs == 1 for strip in strips_of(tmp_path / "o"))
 

@@ -137,9 +137,9 @@ def run_and_kill_workers(archive: Path, output: Path, engine: str) -> int:
         wait_for(process, output, strips)
         wait_until(process, lambda: kill_a_worker(process.pid))  # those killed before are being replaced
         killed += process.poll() is None
-    told, _ = process.communicate(timeout=MOST_SECONDS)
+    output_text, _ = process.communicate(timeout=MOST_SECONDS)
     if process.returncode:  # a strip whose worker was hit three times is given up, and made by the next run
-        assert "3 workers died at it" in told, told
+        assert "3 workers crashed at it" in output_text, output_text
         finish(start(archive, output, f"engine={engine}"))
     return killed
 

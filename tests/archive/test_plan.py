@@ -1,5 +1,6 @@
 """Strips that fit the memory, what a run takes, and the ledger that says what is done."""
 
+import sqlite3
 import threading
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -7,7 +8,8 @@ from dataclasses import replace
 import pytest
 
 from lsvision.archive import Ledger, ScanRow, StripRow, find_scans, ledger_lines, read_calibrations
-from lsvision.archive.plan import IDLE_BYTES, plan_run, predicted_bytes, predicted_seconds, rows_for_memory
+from lsvision.archive.plan import plan_run, predicted_bytes, predicted_seconds
+from lsvision.archive.planned import IDLE_BYTES, rows_for_memory
 from lsvision.errors import FileFormatError
 from tests.archive.archives import PROCESSING
 
@@ -44,8 +46,10 @@ def test_time_and_size_before_it_starts(archive, calibration, tmp_path):
 
 
 def test_rows_come_back_and_runs_of_a_strip_are_counted(tmp_path):
-    scan = ScanRow("ä/1", "/ä/1", "done", lines=7, seconds=0.1 + 0.2, measured=0.5, stamp="s", input_sha256="i")
-    strip = StripRow("ä/1", "product", 3, "key", "done", lines=7, seconds=0.25, measured=11)
+    scan = ScanRow("ä/1", "/ä/1", "done", lines=7, seconds=0.1 + 0.2, measured_share=0.5, stamp="s", input_sha256="i")
+    strip = StripRow(
+        "ä/1", "product", 3, "key", "done", lines=7, seconds=0.25, measured_cells=11, lowest_mm=-0.5, highest_mm=2.25
+    )
     with Ledger(tmp_path / "ledger.sqlite") as ledger:
         ledger.put_scan(scan)
         ledger.put_strip(strip)
@@ -54,8 +58,8 @@ def test_rows_come_back_and_runs_of_a_strip_are_counted(tmp_path):
         assert ledger.scans() == {"ä/1": scan}
         assert ledger.scan("other") is None
         assert ledger.strips() == [replace(strip, runs=2)]
-        assert list(ledger.done("ä/1", "product", "key")) == [3]
-        assert not ledger.done("ä/1", "product", "another key")
+        assert list(ledger.finished_strips("ä/1", "product", "key")) == [3]
+        assert not ledger.finished_strips("ä/1", "product", "another key")
         assert ledger.seconds_per_line() == {"product": 0.25 / 7}
         ledger.put_strip(replace(strip, key="another key"))
         assert ledger.strips()[0].runs == 1
@@ -77,11 +81,35 @@ def test_a_ledger_that_several_open_while_it_is_made(tmp_path):
 
 
 def test_a_ledger_in_words():
-    rows = {"a": ScanRow("a", "/a", "done", lines=7, measured=0.5), "bb": ScanRow("bb", "/bb", "failed", error="why")}
+    rows = {
+        "a": ScanRow("a", "/a", "done", lines=7, measured_share=0.5),
+        "bb": ScanRow("bb", "/bb", "failed", error="why"),
+    }
     assert list(ledger_lines(rows)) == [
         "a   done          0.0 s  7 lines, 50.0 % measured",
         "bb  failed        0.0 s  why",
     ]
+
+
+def test_a_ledger_of_an_earlier_version_starts_anew(tmp_path, caplog):
+    with sqlite3.connect(tmp_path / "ledger.sqlite") as db:  # as version 1 made it, which recorded no version
+        db.execute("CREATE TABLE scans (scan TEXT PRIMARY KEY, measured REAL)")
+        db.execute("INSERT INTO scans VALUES ('a', 0.5)")
+    db.close()
+    with Ledger(tmp_path / "ledger.sqlite") as ledger:
+        assert ledger.scans() == {}
+        ledger.put_scan(ScanRow("b", "/b", "done"))
+    assert "of an earlier version and starts anew" in caplog.text
+    with Ledger(tmp_path / "ledger.sqlite") as ledger:
+        assert list(ledger.scans()) == ["b"]
+
+
+def test_a_ledger_of_a_later_version_is_refused(tmp_path):
+    with sqlite3.connect(tmp_path / "ledger.sqlite") as db:
+        db.execute("PRAGMA user_version = 99")
+    db.close()
+    with pytest.raises(FileFormatError, match="made by a later version: 99"):
+        Ledger(tmp_path / "ledger.sqlite")
 
 
 def test_what_is_no_ledger(tmp_path):

@@ -118,19 +118,19 @@ def test_a_calibration_for_another_rig_is_refused(scan, command, capsys, tmp_pat
 
 def test_a_product_that_fails_half_way_leaves_nothing(scan, command, tmp_path, monkeypatch, capsys, shared_data):
     from lsvision.errors import LsvisionError
-    from lsvision.experiments import correct
+    from lsvision.stages.correction.correct import Correction
 
     other = tmp_path / "tilt_a"
     shutil.copytree(shared_data / "scans_other_renderer" / "tilt_a", other)
     assert command("+experiment=calibrate", f"scans=[{other}]") == 0
 
-    def failing(*args):
-        strips = correct_scan(*args)
-        yield next(strips)
-        raise LsvisionError("the disk is full")
+    def failing(correction, rows):
+        if rows[0] > 0:
+            raise LsvisionError("the disk is full")
+        return strip(correction, rows)
 
-    correct_scan = correct.correct_scan
-    monkeypatch.setattr(correct, "correct_scan", failing)
+    strip = Correction.strip
+    monkeypatch.setattr(Correction, "strip", failing)
     overrides = ("+experiment=correct", f"scan={other}", f"calibration={tmp_path / 'run' / 'calibration.json'}")
     assert command(*overrides, "correction.strip_rows=100", folder="corrected") == 1
     assert sorted(path.name for path in (tmp_path / "corrected").iterdir()) == [".hydra", "lsvision.log"]

@@ -8,10 +8,10 @@ from pathlib import Path
 import pytest
 import torch
 
-from lsvision.io import ProductLayout, ProductWriter, read_product
+from lsvision.io import ProductLayout, product_writer, read_product
 from lsvision.report import Headline, Page, ReportFigure, Table, calibration_report, product_report, write_report
 from lsvision.report.drawing import label_axes, new_figure
-from lsvision.types import Provenance
+from lsvision.types import ProductGrid, ProductStrip, Provenance
 
 NASTY = "<script>alert('x')</script> & \"quotes\""
 
@@ -117,10 +117,10 @@ def test_calibration_report(tmp_path, determined, corners):
 def test_product_report(tmp_path, measured):
     height = torch.full((20, 30), 2.5) if measured else torch.full((20, 30), torch.nan)
     target = tmp_path / "scan.zarr"
-    layout = ProductLayout((20, 30), 0.5, (1.0, 2.0), 3, torch.uint8, chunk_rows=20, metadata={"scan": NASTY})
-    with ProductWriter(target, layout) as writer:
+    layout = ProductLayout(ProductGrid(20, 30, 0.5, 1.0, 2.0), 3, torch.uint8, chunk_rows=20, metadata={"scan": NASTY})
+    with product_writer(target, layout) as writer:
         color = torch.randint(0, 256, (20, 30, 3)).to(torch.uint8)
-        writer.write(0, color, height, height.isfinite(), torch.zeros(20, 30, 2))
+        writer.write(ProductStrip(0, color, height, height.isfinite(), torch.zeros(20, 30, 2)))
     product_report(read_product(target), 0.5, {"pitch": 0.5}, tmp_path)
     page = read_page(tmp_path)
     assert NASTY in page.text

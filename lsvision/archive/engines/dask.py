@@ -11,27 +11,27 @@ import dask
 from dask.task_spec import Task as Spec
 from distributed import Client, Future, KilledWorker, LocalCluster, Status
 
-from lsvision.archive.engines.protocol import MOST_DEATHS, Finished
-from lsvision.archive.tasks import Task, TaskResult, run_task
+from lsvision.archive.engines.protocol import MAX_WORKER_CRASHES, WORKERS_CRASHED, Finished
+from lsvision.archive.tasks import Outcome, Task, run_in_worker
 from lsvision.errors import ConfigError, LsvisionError
 
-_LOOK_SECONDS = 1.0
+_POLL_SECONDS = 1.0
 
-# Tasks wait at the scheduler, not at a worker: the death of one says something of its own task alone. Dask does not
-# look after local workers that are gone for long: it would end those that are just starting again. A local worker
-# loads what tasks need before it takes one, so that no task answers for that time. It keeps freed memory for the next
-# strip: Dask's own setting gives it back after every operation, which trebles the time.
+# Tasks wait at the scheduler, not at a worker: a crash then says something about the worker's own task alone. Dask does
+# not watch for local workers that are gone for long: it would end those that are just starting again. A local worker
+# imports what tasks need before it takes one, so that no task is blamed for that time. It keeps freed memory for the
+# next strip: Dask's own setting gives it back after every operation, which trebles the time.
 _SETTINGS = {
     "distributed.worker.preload": ["lsvision.archive.tasks"],
     "distributed.nanny.pre-spawn-environ.MALLOC_TRIM_THRESHOLD_": 2**30,
     "distributed.nanny.pre-spawn-environ.MALLOC_ARENA_MAX": 1,
     "distributed.worker.profile.enabled": False,
-    "distributed.scheduler.allowed-failures": MOST_DEATHS - 1,
+    "distributed.scheduler.allowed-failures": MAX_WORKER_CRASHES - 1,
     "distributed.scheduler.worker-saturation": 1.0,
     "distributed.deploy.lost-worker-timeout": "365 days",
     "distributed.comm.timeouts.connect": "10s",
 }
-# What matters of workers that come and go is in the results.
+# Their messages about workers that come and go repeat what the outcomes say.
 _LOGGERS = ("distributed", "distributed.client", "tornado.application")
 
 
@@ -48,7 +48,7 @@ class DaskEngine:
     """
 
     def __init__(self, scheduler: str | None, workers: int, worker_memory_mb: int) -> None:
-        self._done: SimpleQueue[Future] = SimpleQueue()
+        self._finished: SimpleQueue[Future] = SimpleQueue()
         self._tasks: dict[Future, Task] = {}
         self._settings = dask.config.set(_SETTINGS)
         for name in _LOGGERS:
@@ -87,20 +87,20 @@ class DaskEngine:
 
     @property
     def capacity(self) -> int:
-        """A task a thread and as many waiting, so that no worker waits for this process."""
+        """One task per thread and as many waiting, so that no worker waits for this process."""
         return 2 * max(1, self._threads)
 
     def submit(self, task: Task) -> None:
-        """Hand a task to the scheduler."""
-        key = f"{task.stage or 'step'}-{os.urandom(8).hex()}"
-        # One that produces data waits at the scheduler however few there are; others only where there are many.
-        spec = Spec(key, run_task, task, _data_producer=True)
+        """Submit a task to the scheduler."""
+        key = f"{task.strip.stage if task.strip else 'step'}-{os.urandom(8).hex()}"
+        # A data producer waits at the scheduler however few tasks there are; others do so only where there are many.
+        spec = Spec(key, run_in_worker, task, _data_producer=True)
         future = self._client.get({key: spec}, key, sync=False)
         self._tasks[future] = task
-        future.add_done_callback(self._done.put)
+        future.add_done_callback(self._finished.put)
 
     def collect(self) -> list[Finished]:
-        """Wait for a task; workers that died are the scheduler's concern.
+        """Wait for a task; crashed workers are the scheduler's concern.
 
         Raises:
             LsvisionError: the scheduler is gone.
@@ -112,7 +112,7 @@ class DaskEngine:
             if self._cluster is not None and self._threads < self._workers:
                 self._cluster.sync(_replace_lost, self._cluster)
             with suppress(Empty):
-                finished = self._take(self._done.get(timeout=_LOOK_SECONDS))
+                finished = self._take(self._finished.get(timeout=_POLL_SECONDS))
                 if finished is not None:
                     return [finished]
 
@@ -123,21 +123,21 @@ class DaskEngine:
             raise _lost() from error
 
     def _take(self, future: Future) -> Finished | None:
-        """A task and its result; None where that died with the worker that kept it, and the task runs again."""
+        """A task and its outcome; None where that was lost with the worker that kept it, and the task runs again."""
         try:
-            result = future.result(timeout=_LOOK_SECONDS)
-        except TimeoutError:  # not waited for here: it may be for workers that only the next look starts
-            future.add_done_callback(self._done.put)
+            result = future.result(timeout=_POLL_SECONDS)
+        except TimeoutError:  # not waited for here: the workers it needs may only be started by the next poll
+            future.add_done_callback(self._finished.put)
             return None
         except KilledWorker:
-            result = TaskResult(error=f"{MOST_DEATHS} workers died at it, of memory or a signal")
+            result = Outcome(error=WORKERS_CRASHED)
         except (CancelledError, OSError) as error:
             raise _lost() from error
         return self._tasks.pop(future), result
 
 
 async def _replace_lost(cluster: LocalCluster) -> None:
-    """Have workers started for those that died while they started, which are not replaced by themselves."""
+    """Replace workers that crashed while they started: Dask does not do so by itself."""
     for name, nanny in list(cluster.workers.items()):
         if nanny.status in (Status.closed, Status.failed):
             del cluster.workers[name]
@@ -145,4 +145,4 @@ async def _replace_lost(cluster: LocalCluster) -> None:
 
 
 def _lost() -> LsvisionError:
-    return LsvisionError("the Dask scheduler is gone; what was done is kept: run the same again to go on")
+    return LsvisionError("the Dask scheduler is gone; finished strips are kept: run the same command again to go on")

@@ -1,4 +1,4 @@
-"""What an engine is, and the one that works on this machine."""
+"""The engine that works on this machine."""
 
 import logging
 import multiprocessing
@@ -9,10 +9,13 @@ from collections import deque
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from types import TracebackType
+from typing import Literal
 
-from lsvision.archive.engines.protocol import MOST_DEATHS, MOST_FAILED_STARTS, Finished
-from lsvision.archive.tasks import Task, TaskResult, run_task
+from lsvision.archive.engines.protocol import MAX_FAILED_STARTS, MAX_WORKER_CRASHES, WORKERS_CRASHED, Finished
+from lsvision.archive.tasks import Outcome, Task, run_in_worker
 from lsvision.errors import LsvisionError
+
+StartMethod = Literal["forkserver", "spawn"]
 
 log = logging.getLogger(__name__)
 
@@ -20,18 +23,25 @@ log = logging.getLogger(__name__)
 class LocalEngine:
     """Worker processes on this machine.
 
-    Each worker is a pool of its own, so that when one dies it is known which task it was at: the next worker that is
-    free takes that up. A worker gets its first task when it has started, so that no task answers for a failed start.
+    Each worker is a pool of one process, so that it is known which task a crashed worker was at: the next free worker
+    takes that up. A worker gets its first task when it has started, so that no task is blamed for a failed start.
+
+    Args:
+        start_method: of the processes, by ``multiprocessing``'s names; ``forkserver`` where the platform has it, else
+            ``spawn``.
     """
 
-    def __init__(self, workers: int) -> None:
-        self._context = multiprocessing.get_context("forkserver")
-        self._context.set_forkserver_preload(["__main__", "lsvision.archive.tasks"])
+    def __init__(self, workers: int, start_method: StartMethod | None = None) -> None:
+        if start_method is None:
+            start_method = "forkserver" if "forkserver" in multiprocessing.get_all_start_methods() else "spawn"
+        self._context = multiprocessing.get_context(start_method)
+        if start_method == "forkserver":
+            self._context.set_forkserver_preload(["__main__", "lsvision.archive.tasks"])
         self._workers = workers
         self._waiting: deque[Task] = deque()
-        self._deaths: dict[Task, int] = {}
+        self._crashes: dict[Task, int] = {}
         self._idle: list[ProcessPoolExecutor] = []
-        # What every other worker is at: a task, or its start where that is None.
+        # The task that every other worker is at; None while it starts.
         self._busy: dict[Future, tuple[Task | None, ProcessPoolExecutor]] = {}
         self._failed_starts = 0
         for _ in range(workers):
@@ -48,16 +58,16 @@ class LocalEngine:
 
     @property
     def capacity(self) -> int:
-        """A task a worker and as many waiting, so that no worker waits for this process."""
+        """One task per worker and as many waiting, so that no worker waits for this process."""
         return 2 * self._workers
 
     def submit(self, task: Task) -> None:
-        """Take a task for the next worker that is free."""
+        """Take a task for the next free worker."""
         self._waiting.append(task)
-        self._hand_out()
+        self._assign()
 
     def collect(self) -> list[Finished]:
-        """Wait for a worker to be done with a task.
+        """Wait for a worker to finish a task.
 
         Raises:
             LsvisionError: workers do not start.
@@ -65,15 +75,15 @@ class LocalEngine:
         while True:
             ready, _ = wait(self._busy, return_when=FIRST_COMPLETED)
             finished = [item for future in ready if (item := self._take(future)) is not None]
-            self._hand_out()
+            self._assign()
             if finished:
                 return finished
 
-    def _hand_out(self) -> None:
+    def _assign(self) -> None:
         while self._waiting and self._idle:
             pool = self._idle.pop()
             try:
-                future = pool.submit(run_task, self._waiting[0])
+                future = pool.submit(run_in_worker, self._waiting[0])
             except BrokenProcessPool:  # killed while it had nothing to do
                 self._replace(pool)
                 continue
@@ -85,26 +95,26 @@ class LocalEngine:
             result = future.result()
         except BrokenProcessPool:
             self._replace(pool)
-            return self._after_death(task)
+            return self._after_crash(task)
         self._idle.append(pool)
         if task is None:
             self._failed_starts = 0
             return None
-        self._deaths.pop(task, None)
+        self._crashes.pop(task, None)
         return task, result
 
-    def _after_death(self, task: Task | None) -> Finished | None:
+    def _after_crash(self, task: Task | None) -> Finished | None:
         if task is None:
             self._failed_starts += 1
-            if self._failed_starts > MOST_FAILED_STARTS:
+            if self._failed_starts > MAX_FAILED_STARTS:
                 raise LsvisionError(
                     f"workers do not start: {self._failed_starts} of them ended before their first task"
                 )
             return None
-        self._deaths[task] = self._deaths.get(task, 0) + 1
-        if self._deaths[task] >= MOST_DEATHS:
-            return task, TaskResult(error=f"{MOST_DEATHS} workers died at it, of memory or a signal")
-        log.warning("a worker died at %s %d of %s; another takes it up", task.stage or "step", task.number, task.scan)
+        self._crashes[task] = self._crashes.get(task, 0) + 1
+        if self._crashes[task] >= MAX_WORKER_CRASHES:
+            return task, Outcome(error=WORKERS_CRASHED)
+        log.warning("a worker crashed at %s; another takes it up", task)
         self._waiting.appendleft(task)
         return None
 

@@ -1,19 +1,21 @@
-"""What an engine is: it runs tasks on workers and hands back their results."""
+"""What an engine is: it runs tasks and returns their outcomes."""
 
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from types import TracebackType
 from typing import Literal, Protocol
 
-from lsvision.archive.tasks import Task, TaskResult
+import psutil
+
+from lsvision.archive.tasks import Outcome, Task
 from lsvision.schema import Checked, PositiveInt, Text
 
-# A strip that ended this many workers is given up.
-MOST_DEATHS = 3
-MOST_FAILED_STARTS = 10
+# A task that crashed this many workers is given up.
+MAX_WORKER_CRASHES = 3
+WORKERS_CRASHED = f"{MAX_WORKER_CRASHES} workers crashed at it, of memory or a signal"
+MAX_FAILED_STARTS = 10
 
-Finished = tuple[Task, TaskResult]
+Finished = tuple[Task, Outcome]
 
 
 @dataclass(frozen=True)
@@ -32,7 +34,7 @@ class EngineConfig(Checked):
 
 
 class Engine(Protocol):
-    """Runs tasks on workers and says when each is done; every task given to it comes back exactly once."""
+    """Runs tasks and returns their outcomes; every submitted task comes back exactly once."""
 
     def __enter__(self) -> "Engine": ...
 
@@ -42,21 +44,28 @@ class Engine(Protocol):
 
     @property
     def capacity(self) -> int:
-        """Tasks it can work on at once."""
+        """Number of tasks that may be submitted and not yet collected."""
         ...
 
     def submit(self, task: Task) -> None:
-        """Take a task; at most ``capacity`` at once."""
+        """Take a task."""
         ...
 
     def collect(self) -> Sequence[Finished]:
-        """Wait until at least one task is done."""
+        """Wait until at least one task is finished."""
         ...
 
 
 def worker_count(config: EngineConfig) -> int:
-    """Workers of this machine: as many as asked for, else as its cores and memory allow, and one at least."""
+    """Workers of this machine: as many as configured, else as its cores and free memory allow, and at least one."""
     if config.workers is not None:
         return config.workers
-    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_AVPHYS_PAGES")
-    return max(1, min(len(os.sched_getaffinity(0)), memory // (config.worker_memory_mb * 2**20)))
+    return max(1, min(_core_count(), psutil.virtual_memory().available // (config.worker_memory_mb * 2**20)))
+
+
+def _core_count() -> int:
+    """Cores that this process may use."""
+    process = psutil.Process()
+    if hasattr(process, "cpu_affinity"):  # not on macOS
+        return len(process.cpu_affinity())
+    return psutil.cpu_count() or 1

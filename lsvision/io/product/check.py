@@ -1,6 +1,5 @@
 """Re-reading a product: every chunk against its checksum, and the images against each other."""
 
-import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -9,13 +8,15 @@ import torch
 import zarr
 
 from lsvision.errors import FileFormatError
+from lsvision.io.product.layout import image_names
+from lsvision.io.product.measured import MeasuredCells
 from lsvision.io.product.pyramid import level_shape, multiscales
-from lsvision.io.product.reader import image_names, read_product
+from lsvision.io.product.reader import Product, read_product
 
 
 @dataclass(frozen=True)
 class ProductCheck:
-    """What was found in a product that is whole: cells in all, their share with a height, and the range of those."""
+    """What a whole product holds: its cells, the share of them with a height, and the range of those heights."""
 
     rows: int
     columns: int
@@ -32,58 +33,54 @@ def check_product(path: Path | str) -> ProductCheck:
         FileFormatError: metadata that are not those of NGFF 0.5 or do not fit the images, a chunk that is missing or
             damaged, or images that contradict each other; names the image and the rows.
     """
-    path = Path(path)
     product = read_product(path)
-    root = zarr.open_group(path, mode="r")
-    levels = {name: sorted(int(level) for level in root[name].array_keys()) for name in image_names(root)}
-    for name, found in levels.items():
-        _check_metadata(path, name, root[name], found, product.pitch_mm, product.origin_mm)
-        for level in found:
-            _check_level(path, f"{name}/{level}", root[f"{name}/{level}"], level_shape(product.shape, level))
-    valid, low, high = _check_cells(path, root)
+    root = zarr.open_group(product.path, mode="r")
+    for name in image_names(root):
+        levels = _check_metadata(product, name, root[name])
+        for level in range(levels):
+            _check_level(product, f"{name}/{level}", root[f"{name}/{level}"], level_shape(product.shape, level))
+    measured = _check_cells(product, chunk_rows=root["height/0"].chunks[0])
     rows, columns = product.shape
-    return ProductCheck(rows, columns, len(levels["height"]), valid / (rows * columns), low, high)
+    share = measured.count / (rows * columns)
+    return ProductCheck(rows, columns, levels, share, measured.lowest_mm, measured.highest_mm)
 
 
-def _check_metadata(
-    path: Path, name: str, group: Any, levels: list[int], pitch_mm: float, origin_mm: tuple[float, float]
-) -> None:
+def _check_metadata(product: Product, name: str, group: Any) -> int:
+    """Number of levels of an image whose metadata describe them."""
+    levels = sorted(int(level) for level in group.array_keys())
     axes = ("c", "y", "x") if group["0"].ndim == 3 else ("y", "x")
-    expected = multiscales(name, axes, pitch_mm, origin_mm, len(levels), averaged=name == "color")
+    expected = multiscales(name, axes, product.grid, len(levels), averaged=name == "color")
     if levels != list(range(len(levels))) or group.attrs.get("ome") != expected:
-        raise FileFormatError(path, "the metadata do not describe the image and its pyramid in NGFF 0.5", f"{name}.ome")
+        problem = "the metadata do not describe the image and its pyramid in NGFF 0.5"
+        raise FileFormatError(product.path, problem, f"{name}.ome")
+    return len(levels)
 
 
-def _check_level(path: Path, key: str, array: Any, shape: tuple[int, int]) -> None:
+def _check_level(product: Product, key: str, array: Any, shape: tuple[int, int]) -> None:
     """Shape and checksums of one level; a chunk whose checksum fails cannot be read."""
     if array.shape[-2:] != shape:
-        raise FileFormatError(path, f"expected {shape[0]} x {shape[1]} cells, got {array.shape}", key)
+        raise FileFormatError(product.path, f"expected {shape[0]} x {shape[1]} cells, got {array.shape}", key)
     if array.nchunks_initialized != array.nchunks:
         missing = array.nchunks - array.nchunks_initialized
-        raise FileFormatError(path, f"{missing} of {array.nchunks} chunks are missing", key)
+        raise FileFormatError(product.path, f"{missing} of {array.nchunks} chunks are missing", key)
     step = array.chunks[-2]
     for row in range(0, shape[0], step):
         try:
             array[..., row : row + step, :]
         except Exception as error:  # on damaged data each codec raises a type of its own
-            raise FileFormatError(path, f"rows {row}-{min(row + step, shape[0]) - 1}: damaged: {error}", key) from error
+            rows = f"rows {row}-{min(row + step, shape[0]) - 1}"
+            raise FileFormatError(product.path, f"{rows}: damaged: {error}", key) from error
 
 
-def _check_cells(path: Path, root: Any) -> tuple[int, float, float]:
-    """Number of valid cells and the range of their heights; that the images agree on which cells those are."""
-    heights, valids, sources = root["height/0"], root["valid/0"], root["source/0"]
-    step = heights.chunks[0]
-    count, low, high = 0, math.inf, -math.inf
-    for row in range(0, heights.shape[0], step):
-        height = torch.from_numpy(heights[row : row + step])
-        valid = torch.from_numpy(valids[row : row + step])
-        source = torch.from_numpy(sources[:, row : row + step])
+def _check_cells(product: Product, chunk_rows: int) -> MeasuredCells:
+    """The measured cells of a product whose images agree on which cells those are."""
+    parts = []
+    for row in range(0, product.grid.rows, chunk_rows):
+        stop = min(row + chunk_rows, product.grid.rows)
+        height, valid, source = product.height(row, stop), product.valid(row, stop), product.source(row, stop)
         if not torch.equal(torch.isfinite(height), valid):
-            raise FileFormatError(path, f"rows {row}-{row + len(valid) - 1}: heights where there are none", "valid")
-        if not bool(torch.isfinite(source)[:, valid].all()):
-            raise FileFormatError(path, f"rows {row}-{row + len(valid) - 1}: heights from nowhere", "source")
-        measured = height[valid]
-        if measured.numel():
-            count += measured.numel()
-            low, high = min(low, float(measured.min())), max(high, float(measured.max()))
-    return count, low, high
+            raise FileFormatError(product.path, f"rows {row}-{stop - 1}: heights of cells that are invalid", "valid")
+        if not bool(torch.isfinite(source)[valid].all()):
+            raise FileFormatError(product.path, f"rows {row}-{stop - 1}: heights without a source", "source")
+        parts.append(MeasuredCells.of(height, valid))
+    return MeasuredCells.total(parts)

@@ -27,7 +27,8 @@ def export_product(product: Product, kind: ExportFormat, base: Path) -> list[Pat
         The files written.
 
     Raises:
-        FileFormatError: the product's metadata lack the datum of its heights. ConfigError: laspy is not installed.
+        FileFormatError: the product's metadata lack the datum of its heights.
+        ConfigError: laspy is not installed.
     """
     if kind == "tiff":
         return _write_images(product, base)
@@ -39,31 +40,38 @@ def export_product(product: Product, kind: ExportFormat, base: Path) -> list[Pat
 
 def _write_images(product: Product, base: Path) -> list[Path]:
     rows, columns = product.shape
-    starts = range(0, rows, _ROWS)
+    ranges = [(row, min(row + _ROWS, rows)) for row in range(0, rows, _ROWS)]
+    color_file, height_file = (base.with_name(f"{base.name}_{name}.tif") for name in ("color", "height"))
     first = product.color(0, min(1, rows))
-    files = [base.with_name(f"{base.name}_{name}.tif") for name in ("color", "height")]
-    colors = (product.color(row, min(row + _ROWS, rows)) for row in starts)
-    write_line_image(files[0], colors, (rows, columns, first.shape[2]), first.dtype)
-    heights = (product.height(row, min(row + _ROWS, rows))[..., None] for row in starts)
-    write_line_image(files[1], heights, (rows, columns, 1), torch.float32)
-    return files
+    colors = (product.color(start, stop) for start, stop in ranges)
+    write_line_image(color_file, colors, (rows, columns, first.shape[2]), first.dtype)
+    heights = (product.height(start, stop)[..., None] for start, stop in ranges)
+    write_line_image(height_file, heights, (rows, columns, 1), torch.float32)
+    return [color_file, height_file]
 
 
 def _points(product: Product) -> Iterator[tuple[Tensor, Tensor]]:
     """Points, mm, and their colours of eight bits, some rows at a time."""
-    # Products of version 0.1 count heights from the depth of zero disparity itself.
-    datum_mm = product.metadata.get("height_datum_mm", product.metadata.get("zero_disparity_mm"))
-    if not isinstance(datum_mm, float):
-        raise FileFormatError(product.path, f"expected a number, got {datum_mm!r}", "lsvision.height_datum_mm")
-    (origin_y, origin_x), (rows, columns) = product.origin_mm, product.shape
-    q_x = origin_x + product.pitch_mm * torch.arange(columns, dtype=torch.float64)
-    for row in range(0, rows, _ROWS):
-        stop = min(row + _ROWS, rows)
+    datum, grid = height_datum(product), product.grid
+    q_x = grid.origin_x_mm + grid.pitch_mm * torch.arange(grid.columns, dtype=torch.float64)
+    for row in range(0, grid.rows, _ROWS):
+        stop = min(row + _ROWS, grid.rows)
         height, valid, color = product.height(row, stop), product.valid(row, stop), product.color(row, stop)
-        q_y = origin_y + product.pitch_mm * torch.arange(row, stop, dtype=torch.float64)
-        places = torch.stack(
-            [q_x.expand(valid.shape), q_y[:, None].expand(valid.shape), datum_mm - height.double()], dim=-1
-        )
+        q_y = grid.origin_y_mm + grid.pitch_mm * torch.arange(row, stop, dtype=torch.float64)
+        q_z = datum - height.double()
+        points = torch.stack([q_x.expand(valid.shape), q_y[:, None].expand(valid.shape), q_z], dim=-1)
         if color.dtype == torch.uint16:
             color = (color.to(torch.int32) // 257).to(torch.uint8)
-        yield places[valid], color.expand(*valid.shape, 3)[valid]
+        yield points[valid], color.expand(*valid.shape, 3)[valid]
+
+
+def height_datum(product: Product) -> float:
+    """q_z of height zero, mm; products of version 0.1 count heights from the depth of zero disparity itself.
+
+    Raises:
+        FileFormatError: the metadata give neither.
+    """
+    datum = product.metadata.get("height_datum_mm", product.metadata.get("zero_disparity_mm"))
+    if not isinstance(datum, float):
+        raise FileFormatError(product.path, f"expected a number, got {datum!r}", "lsvision.height_datum_mm")
+    return datum

@@ -1,4 +1,4 @@
-"""The pyramid of a product's images: every level half as fine as the one before, for a look at scans of any length.
+"""The pyramid of a product's images: every level half as fine as the one before, for viewing scans of any length.
 
 Source: OME-NGFF 0.5, multiscales.
 """
@@ -8,13 +8,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-_LEAST_CELLS = 256  # along the shorter side of the coarsest level
+from lsvision.types import ProductGrid
+
+_MIN_CELLS = 256  # along the shorter side of the coarsest level
 
 
 def level_count(shape: tuple[int, int], chunk_rows: int) -> int:
     """Levels, full resolution included, of an image of (rows, columns) whose chunks can be halved with it."""
     levels = 1
-    while min(level_shape(shape, levels)) >= _LEAST_CELLS and chunk_rows % 2**levels == 0:
+    while min(level_shape(shape, levels)) >= _MIN_CELLS and chunk_rows % 2**levels == 0:
         levels += 1
     return levels
 
@@ -38,22 +40,20 @@ def halve(block: Tensor, *, average: bool) -> Tensor:
     return torch.from_numpy(cv2.resize(even, size, interpolation=cv2.INTER_AREA)).reshape(size[1], size[0], -1)
 
 
-def multiscales(
-    name: str, axes: tuple[str, ...], pitch_mm: float, origin_mm: tuple[float, float], levels: int, *, averaged: bool
-) -> dict:
+def multiscales(name: str, axes: tuple[str, ...], grid: ProductGrid, levels: int, *, averaged: bool) -> dict:
     """NGFF metadata of one image: axes in mm, and for each level its pitch and the place of its cell (0, 0).
 
     Args:
-        origin_mm: (q_y, q_x) of the centre of cell (0, 0) at full resolution.
         averaged: whether a cell of a coarser level is centred on the cells it was made from, or on the first of them.
     """
     leading = len(axes) - 2
     datasets = []
     for level in range(levels):
-        pitch = pitch_mm * 2**level
-        shift = (pitch - pitch_mm) / 2 if averaged else 0.0
+        pitch = grid.pitch_mm * 2**level
+        shift = (pitch - grid.pitch_mm) / 2 if averaged else 0.0
+        place = [grid.origin_y_mm + shift, grid.origin_x_mm + shift]
         scale = {"type": "scale", "scale": [1.0] * leading + [pitch, pitch]}
-        translation = {"type": "translation", "translation": [0.0] * leading + [at + shift for at in origin_mm]}
+        translation = {"type": "translation", "translation": [0.0] * leading + place}
         datasets.append({"path": str(level), "coordinateTransformations": [scale, translation]})
     image = {"name": name, "axes": [_axis(axis) for axis in axes], "datasets": datasets}
     image["type"] = "mean" if averaged else "nearest"

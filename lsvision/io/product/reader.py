@@ -1,12 +1,9 @@
-"""The product of a corrected scan: an OME-Zarr group of colour, height, validity and source, opened for reading.
-
-Source: OME-NGFF 0.5 on Zarr 3.
-"""
+"""The product of a corrected scan, opened for reading."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Literal
 
 import numpy as np
 import torch
@@ -15,29 +12,51 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from lsvision.errors import FileFormatError
+from lsvision.io.product.layout import FULL_LEVEL, PRODUCT_FORMAT, image_names
 from lsvision.schema import shown
+from lsvision.types import ProductGrid, ProductStrip
 
-PRODUCT_FORMAT = "lsvision-product/1"
-FULL_LEVEL = "0"  # of an image's pyramid
-
-
-def image_names(root: Any) -> list[str]:
-    """The images of an open product: these four, and ``sigma`` where it was asked for."""
-    return ["color", "height", "valid", "source", *(["sigma"] if "sigma" in root else [])]
+ImageName = Literal["color", "height", "valid", "source", "sigma"]
 
 
 @dataclass(frozen=True)
 class Product:
-    """A product on disk: its grid and metadata; the images are read by ranges of rows.
-
-    ``shape`` is (rows, columns), ``origin_mm`` the (q_y, q_x) of the centre of cell (0, 0).
-    """
+    """A product on disk: its grid and metadata; the images are read by ranges of rows."""
 
     path: Path
-    shape: tuple[int, int]
-    pitch_mm: float
-    origin_mm: tuple[float, float]
+    grid: ProductGrid
     metadata: Mapping[str, object]
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(rows, columns)."""
+        return self.grid.rows, self.grid.columns
+
+    @property
+    def pitch_mm(self) -> float:
+        """Side of a cell, mm."""
+        return self.grid.pitch_mm
+
+    @property
+    def origin_mm(self) -> tuple[float, float]:
+        """(q_y, q_x) of the centre of cell (0, 0), mm."""
+        return self.grid.origin_y_mm, self.grid.origin_x_mm
+
+    @property
+    def has_sigma(self) -> bool:
+        """Whether the product holds the standard deviations of its positions."""
+        return (self.path / "sigma").is_dir()
+
+    def read(self, start: int, stop: int) -> ProductStrip:
+        """Rows ``start..stop-1`` of every image."""
+        return ProductStrip(
+            row=start,
+            color=self.color(start, stop),
+            height=self.height(start, stop),
+            valid=self.valid(start, stop),
+            source=self.source(start, stop),
+            sigma=self.sigma(start, stop) if self.has_sigma else None,
+        )
 
     def color(self, start: int, stop: int) -> Tensor:
         """Colours of rows ``start..stop-1``, (rows, columns, channels)."""
@@ -48,35 +67,53 @@ class Product:
         return self._read("height", start, stop)
 
     def valid(self, start: int, stop: int) -> Bool[Tensor, "rows columns"]:
-        """Whether cells of rows ``start..stop-1`` were seen."""
+        """Whether cells of rows ``start..stop-1`` were measured."""
         return self._read("valid", start, stop)
 
     def source(self, start: int, stop: int) -> Float[Tensor, "rows columns 2"]:
-        """(line, column) of the scan that cells of rows ``start..stop-1`` came from; NaN where invalid."""
+        """(line, column) of the scan that cells of rows ``start..stop-1`` came from; NaN where nothing was seen."""
         return self._read("source", start, stop)
 
     def sigma(self, start: int, stop: int) -> Float[Tensor, "rows columns 3"]:
         """Standard deviations of (q_x, q_y, q_z), mm, of rows ``start..stop-1``; of products made with uncertainty."""
         return self._read("sigma", start, stop)
 
-    @property
-    def has_sigma(self) -> bool:
-        """Whether the product says how well its positions are known."""
-        return (self.path / "sigma").is_dir()
-
     def _read(self, name: str, start: int, stop: int) -> Tensor:
-        if not 0 <= start <= stop <= self.shape[0]:
-            raise ValueError(f"start, stop: expected a range within 0..{self.shape[0]}, got {start}..{stop}")
+        if not 0 <= start <= stop <= self.grid.rows:
+            raise ValueError(f"start, stop: expected a range within 0..{self.grid.rows}, got {start}..{stop}")
         array = zarr.open_array(self.path / name / FULL_LEVEL, mode="r")
         block = np.asarray(array[..., start:stop, :])
         return torch.from_numpy(np.ascontiguousarray(np.moveaxis(block, 0, -1) if block.ndim == 3 else block))
+
+
+@dataclass(frozen=True)
+class ProductImage:
+    """One image of a product, as a ``LineImage``."""
+
+    product: Product
+    name: ImageName
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """(rows, columns, channels)."""
+        return *self.product.shape, self.read(0, 0).shape[2]
+
+    @property
+    def dtype(self) -> torch.dtype:
+        """That of the image."""
+        return self.read(0, 0).dtype
+
+    def read(self, start: int, stop: int) -> Tensor:
+        """Rows ``start..stop-1``."""
+        block: Tensor = getattr(self.product, self.name)(start, stop)
+        return block if block.ndim == 3 else block[..., None]
 
 
 def read_product(path: Path | str) -> Product:
     """Open a product.
 
     Raises:
-        FileFormatError: there is none, or it is of another kind or incomplete.
+        FileFormatError: there is no product, or it is of another kind or incomplete.
     """
     path = Path(path)
     try:
@@ -94,5 +131,5 @@ def read_product(path: Path | str) -> Product:
     for name, shape in shapes.items():
         if shape != (rows, columns):
             raise FileFormatError(path, f"expected {rows} x {columns} cells as height has", name)
-    q_y, q_x = translation["translation"]
-    return Product(path, (rows, columns), float(scale["scale"][-1]), (float(q_y), float(q_x)), metadata)
+    origin_y, origin_x = map(float, translation["translation"])
+    return Product(path, ProductGrid(rows, columns, float(scale["scale"][-1]), origin_y, origin_x), metadata)

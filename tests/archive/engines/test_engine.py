@@ -1,4 +1,4 @@
-"""Workers that die, and engines that bring every task back once."""
+"""Workers that crash, and engines that bring every task back once."""
 
 import os
 import signal
@@ -9,23 +9,23 @@ from pathlib import Path
 import pytest
 
 from lsvision.archive import EngineConfig, LocalEngine, worker_count
-from lsvision.archive.tasks import Task, TaskResult, run_task
+from lsvision.archive.tasks import Task, run_task
 from lsvision.errors import FileFormatError
 
 
 @dataclass(frozen=True)
 class Deadly:
-    """Kills its worker as often as told, which it counts in a file."""
+    """Kills its worker the first ``times`` times that it runs, which it counts in a file."""
 
     count: str
     times: int
 
-    def run(self) -> TaskResult:
+    def run(self) -> str:
         with Path(self.count).open("a") as file:
             file.write("x")
         if Path(self.count).stat().st_size <= self.times:
             os.kill(os.getpid(), signal.SIGKILL)
-        return TaskResult(value="survived")
+        return "survived"
 
 
 @dataclass(frozen=True)
@@ -34,18 +34,18 @@ class Faulty:
 
     error: Exception
 
-    def run(self) -> TaskResult:
+    def run(self) -> None:
         raise self.error
 
 
 @dataclass(frozen=True)
 class Number:
-    """Says its number."""
+    """Returns its number."""
 
     number: int
 
-    def run(self) -> TaskResult:
-        return TaskResult(measured=self.number)
+    def run(self) -> int:
+        return self.number
 
 
 @dataclass(frozen=True)
@@ -54,9 +54,8 @@ class Asleep:
 
     seconds: float
 
-    def run(self) -> TaskResult:
+    def run(self) -> None:
         time.sleep(self.seconds)
-        return TaskResult()
 
 
 def collected(engine, tasks) -> dict:
@@ -72,19 +71,19 @@ def collected(engine, tasks) -> dict:
     return dict(found)
 
 
-def test_every_task_comes_back_once_though_workers_die(tmp_path):
+def test_every_task_comes_back_once_though_workers_crash(tmp_path):
     tasks = [Task("a", Number(number)) for number in range(12)]
     once, always = Task("b", Deadly(str(tmp_path / "once"), 1)), Task("c", Deadly(str(tmp_path / "always"), 9))
     with LocalEngine(2) as engine:
         found = collected(engine, [*tasks, once, always])
-    assert [found[task].measured for task in tasks] == list(range(12))
-    assert found[once].value == "survived"
-    assert found[always].error == "3 workers died at it, of memory or a signal"
+    assert [found[task].result for task in tasks] == list(range(12))
+    assert found[once].result == "survived"
+    assert found[always].error == "3 workers crashed at it, of memory or a signal"
     assert (tmp_path / "always").stat().st_size == 3
 
 
 @pytest.mark.slow
-def test_dask_brings_every_task_back_once_though_workers_die(tmp_path):
+def test_dask_brings_every_task_back_once_though_workers_crash(tmp_path):
     pytest.importorskip("distributed")
     from lsvision.archive.engines.dask import DaskEngine
 
@@ -92,9 +91,9 @@ def test_dask_brings_every_task_back_once_though_workers_die(tmp_path):
     once, always = Task("b", Deadly(str(tmp_path / "once"), 1)), Task("c", Deadly(str(tmp_path / "always"), 9))
     with DaskEngine(None, 2, 3072) as engine:
         found = collected(engine, [*tasks, once, always])
-    assert [found[task].measured for task in tasks] == list(range(12))
-    assert found[once].value == "survived"
-    assert found[always].error == "3 workers died at it, of memory or a signal"
+    assert [found[task].result for task in tasks] == list(range(12))
+    assert found[once].result == "survived"
+    assert found[always].error == "3 workers crashed at it, of memory or a signal"
 
 
 @pytest.mark.slow
@@ -106,7 +105,7 @@ def test_dask_lets_no_task_wait_where_another_could_end_the_worker():
         for number in range(2):
             engine.submit(Task(f"{number}", Asleep(1.0)))
         most = 0
-        while engine._done.empty():
+        while engine._finished.empty():
             most = max([most, *map(len, engine._client.processing().values())])
         assert most == 1
         assert len([*engine.collect(), *engine.collect()]) == 2
@@ -120,12 +119,12 @@ def test_dask_runs_a_task_again_whose_result_died_with_all_workers():
     task = Task("a", Number(5))
     with DaskEngine(None, 1, 3072) as engine:
         engine.submit(task)
-        future = engine._done.get(timeout=60)
+        future = engine._finished.get(timeout=60)
         engine._client.sync(engine._cluster.workers[0].close)  # its nanny with it: nobody starts another by himself
         while engine._client.nthreads():
             time.sleep(0.01)
         assert engine._take(future) is None
-        assert [(found, result.measured) for found, result in engine.collect()] == [(task, 5)]
+        assert [(found, outcome.result) for found, outcome in engine.collect()] == [(task, 5)]
 
 
 @pytest.mark.parametrize(

@@ -10,9 +10,10 @@ import tifffile
 import torch
 
 from lsvision.errors import FileFormatError
-from lsvision.io import Product, ProductLayout, ProductWriter, export_product, read_product
+from lsvision.io import Product, ProductLayout, export_product, product_writer, read_product
+from lsvision.types import ProductGrid, ProductStrip
 
-ROWS, COLUMNS, PITCH, Z0 = 300, 40, 0.25, 796.9
+ROWS, COLUMNS, PITCH, DATUM = 300, 40, 0.25, 796.9
 ORIGIN_Y, ORIGIN_X = 1000.0, -80.0
 
 
@@ -20,10 +21,10 @@ def write(path: Path, *, dtype: torch.dtype = torch.uint8, channels: int = 3, me
     color = torch.randint(0, 255, (ROWS, COLUMNS, channels)).to(dtype) * (257 if dtype == torch.uint16 else 1)
     valid = torch.rand(ROWS, COLUMNS) < 0.7
     height = (20 * torch.randn(ROWS, COLUMNS)).masked_fill(~valid, torch.nan)
-    metadata = {"zero_disparity_mm": Z0} if metadata is None else metadata
-    layout = ProductLayout((ROWS, COLUMNS), PITCH, (ORIGIN_Y, ORIGIN_X), channels, dtype, 512, metadata)
-    with ProductWriter(path, layout) as writer:
-        writer.write(0, color, height, valid, torch.zeros(ROWS, COLUMNS, 2))
+    metadata = {"zero_disparity_mm": 1.0, "height_datum_mm": DATUM} if metadata is None else metadata
+    layout = ProductLayout(ProductGrid(ROWS, COLUMNS, PITCH, ORIGIN_Y, ORIGIN_X), channels, dtype, 512, metadata)
+    with product_writer(path, layout) as writer:
+        writer.write(ProductStrip(0, color, height, valid, torch.zeros(ROWS, COLUMNS, 2)))
     return read_product(path)
 
 
@@ -31,7 +32,7 @@ def true_points(product: Product) -> tuple[np.ndarray, np.ndarray]:
     """(q_x, q_y, q_z) in mm and colours of all valid cells, row by row."""
     height, color = product.height(0, ROWS).double().numpy(), product.color(0, ROWS).numpy()
     row, column = np.nonzero(np.isfinite(height))
-    points = np.stack([ORIGIN_X + PITCH * column, ORIGIN_Y + PITCH * row, Z0 - height[row, column]], axis=-1)
+    points = np.stack([ORIGIN_X + PITCH * column, ORIGIN_Y + PITCH * row, DATUM - height[row, column]], axis=-1)
     return points, color[row, column]
 
 
@@ -66,6 +67,13 @@ def test_tiff_in_tifffile(tmp_path: Path) -> None:
     np.testing.assert_array_equal(tifffile.imread(height), product.height(0, ROWS).numpy())
     with tifffile.TiffFile(height) as file:
         assert file.is_bigtiff
+
+
+def test_older_products_count_heights_from_their_zero_disparity(tmp_path: Path) -> None:
+    product = write(tmp_path / "a.zarr", metadata={"zero_disparity_mm": DATUM})
+    (file,) = export_product(product, "ply", tmp_path / "a")
+    vertices, (points, _) = plyfile.PlyData.read(file)["vertex"], true_points(product)
+    np.testing.assert_allclose(vertices["z"], points[:, 2], rtol=0, atol=1e-9)
 
 
 def test_a_product_without_its_depth_makes_no_points(tmp_path: Path) -> None:

@@ -7,13 +7,13 @@ import pytest
 import torch
 
 from lsvision.errors import FileFormatError
-from lsvision.io import ProductLayout, ProductRows, ProductWriter, complete_product, create_product, read_product
+from lsvision.io import ProductLayout, ProductRows, complete_product, create_product, product_writer, read_product
+from lsvision.types import ProductGrid, ProductStrip
 
 ROWS, COLUMNS = 70, 12
+GRID_9 = ProductGrid(ROWS, COLUMNS, 9.0, -3.5, 120.25)
 OPTIONS = {
-    "shape": (ROWS, COLUMNS),
-    "pitch_mm": 0.28,
-    "origin_mm": (-3.5, 120.25),
+    "grid": ProductGrid(ROWS, COLUMNS, 0.28, -3.5, 120.25),
     "channels": 3,
     "dtype": torch.uint8,
     "chunk_rows": 32,
@@ -33,9 +33,9 @@ def planes(dtype: torch.dtype = torch.uint8, channels: int = 3) -> tuple[torch.T
 def test_blocks_come_back(tmp_path: Path, dtype: torch.dtype, channels: int, blocks: list) -> None:
     written = planes(dtype, channels)
     options = OPTIONS | {"dtype": dtype, "channels": channels}
-    with ProductWriter(tmp_path / "a.zarr", ProductLayout(**options)) as writer:
+    with product_writer(tmp_path / "a.zarr", ProductLayout(**options)) as writer:
         for start, stop in blocks:
-            writer.write(start, *(plane[start:stop] for plane in written))
+            writer.write(ProductStrip(start, *(plane[start:stop] for plane in written)))
         assert not (tmp_path / "a.zarr").exists()
     product = read_product(tmp_path / "a.zarr")
     read = (product.color, product.height, product.valid, product.source)
@@ -44,12 +44,18 @@ def test_blocks_come_back(tmp_path: Path, dtype: torch.dtype, channels: int, blo
             found = plane(start, stop)
             assert found.dtype == expected.dtype
             np.testing.assert_array_equal(found.numpy(), expected[start:stop].numpy())
+        strip = product.read(start, stop)
+        assert strip.row == start
+        assert strip.sigma is None
+        for expected, found in zip(written, (strip.color, strip.height, strip.valid, strip.source), strict=True):
+            np.testing.assert_array_equal(found.numpy(), expected[start:stop].numpy())
+    assert product.grid == OPTIONS["grid"]
     assert (product.shape, product.pitch_mm, product.origin_mm) == ((ROWS, COLUMNS), 0.28, (-3.5, 120.25))
     assert product.metadata == {"scan": "A", "zero_disparity_mm": 796.9, "format": "lsvision-product/1"}
 
 
 def test_rows_never_written_are_invalid(tmp_path: Path) -> None:
-    with ProductWriter(tmp_path / "a.zarr", ProductLayout(**OPTIONS)):
+    with product_writer(tmp_path / "a.zarr", ProductLayout(**OPTIONS)):
         pass
     product = read_product(tmp_path / "a.zarr")
     assert not product.valid(0, ROWS).any()
@@ -58,7 +64,7 @@ def test_rows_never_written_are_invalid(tmp_path: Path) -> None:
 
 
 def test_metadata_is_that_of_ome_zarr(tmp_path: Path) -> None:
-    with ProductWriter(tmp_path / "a.zarr", ProductLayout(**OPTIONS)):
+    with product_writer(tmp_path / "a.zarr", ProductLayout(**OPTIONS)):
         pass
     for name, dtype, leading in (("color", "uint8", 3), ("height", "float32", 0), ("valid", "bool", 0)):
         group = json.loads((tmp_path / "a.zarr" / name / "zarr.json").read_text())
@@ -84,31 +90,34 @@ def test_metadata_is_that_of_ome_zarr(tmp_path: Path) -> None:
         assert array["codecs"][-1]["name"] == "crc32c"
 
 
-def break_off(writer: ProductWriter) -> None:
-    writer.write(0, *planes())
+def break_off(writer: ProductRows) -> None:
+    writer.write(ProductStrip(0, *planes()))
     raise ZeroDivisionError
 
 
 def test_failure_leaves_nothing_or_the_earlier_product(tmp_path: Path) -> None:
-    with pytest.raises(ZeroDivisionError), ProductWriter(tmp_path / "a.zarr", ProductLayout(**OPTIONS)) as writer:
+    with pytest.raises(ZeroDivisionError), product_writer(tmp_path / "a.zarr", ProductLayout(**OPTIONS)) as writer:
         break_off(writer)
     assert not any(tmp_path.iterdir())
-    with ProductWriter(tmp_path / "a.zarr", ProductLayout(**OPTIONS)):
+    with product_writer(tmp_path / "a.zarr", ProductLayout(**OPTIONS)):
         pass
     with (
         pytest.raises(ZeroDivisionError),
-        ProductWriter(tmp_path / "a.zarr", ProductLayout(**OPTIONS | {"pitch_mm": 9.0})),
+        product_writer(tmp_path / "a.zarr", ProductLayout(**OPTIONS | {"grid": GRID_9})),
     ):
         raise ZeroDivisionError
     assert read_product(tmp_path / "a.zarr").pitch_mm == 0.28
     assert [path.name for path in tmp_path.iterdir()] == ["a.zarr"]
-    with ProductWriter(tmp_path / "a.zarr", ProductLayout(**OPTIONS | {"pitch_mm": 9.0})):
+    with product_writer(tmp_path / "a.zarr", ProductLayout(**OPTIONS | {"grid": GRID_9})):
         pass
     assert read_product(tmp_path / "a.zarr").pitch_mm == 9.0
 
 
 def test_failure_to_begin_leaves_nothing(tmp_path: Path) -> None:
-    with pytest.raises(KeyError), ProductWriter(tmp_path / "a.zarr", ProductLayout(**OPTIONS | {"dtype": torch.int32})):
+    with (
+        pytest.raises(KeyError),
+        product_writer(tmp_path / "a.zarr", ProductLayout(**OPTIONS | {"dtype": torch.int32})),
+    ):
         pass
     assert not any(tmp_path.iterdir())
 
@@ -128,15 +137,15 @@ def test_blocks_that_do_not_fit(tmp_path: Path, row: int, change: dict, message:
     blocks = [change.get(index, plane) for index, plane in enumerate(planes())]
     with (
         pytest.raises(ValueError, match=message),
-        ProductWriter(tmp_path / "a.zarr", ProductLayout(**OPTIONS)) as writer,
+        product_writer(tmp_path / "a.zarr", ProductLayout(**OPTIONS)) as writer,
     ):
-        writer.write(row, *blocks)
+        writer.write(ProductStrip(row, *blocks))
 
 
 def test_what_is_not_a_product(tmp_path: Path) -> None:
     with pytest.raises(FileFormatError, match="not a readable product"):
         read_product(tmp_path / "nowhere")
-    with ProductWriter(tmp_path / "a.zarr", ProductLayout(**OPTIONS)):
+    with product_writer(tmp_path / "a.zarr", ProductLayout(**OPTIONS)):
         pass
     root = tmp_path / "a.zarr" / "zarr.json"
     root.write_text(root.read_text().replace("lsvision-product/1", "lsvision-product/7"))
@@ -145,7 +154,7 @@ def test_what_is_not_a_product(tmp_path: Path) -> None:
 
 
 def test_range_outside_the_grid(tmp_path: Path) -> None:
-    with ProductWriter(tmp_path / "a.zarr", ProductLayout(**OPTIONS)):
+    with product_writer(tmp_path / "a.zarr", ProductLayout(**OPTIONS)):
         pass
     with pytest.raises(ValueError, match=r"within 0..70, got 60..71"):
         read_product(tmp_path / "a.zarr").height(60, 71)
@@ -153,7 +162,9 @@ def test_range_outside_the_grid(tmp_path: Path) -> None:
 
 def test_origin_and_pitch_are_exact(tmp_path: Path) -> None:
     origin = (1 / 3, -math.pi * 1e5)
-    with ProductWriter(tmp_path / "a.zarr", ProductLayout(**OPTIONS | {"origin_mm": origin, "pitch_mm": 0.1 + 0.2})):
+    with product_writer(
+        tmp_path / "a.zarr", ProductLayout(**OPTIONS | {"grid": ProductGrid(ROWS, COLUMNS, 0.1 + 0.2, *origin)})
+    ):
         pass
     product = read_product(tmp_path / "a.zarr")
     assert (product.origin_mm, product.pitch_mm) == (origin, 0.1 + 0.2)
@@ -164,7 +175,7 @@ def test_rows_written_in_place_by_several_writers_make_the_same_product(tmp_path
     layout = ProductLayout(**OPTIONS)
     create_product(tmp_path / "partial", layout)
     for start, stop in [(64, 70), (0, 32), (32, 64)]:
-        ProductRows(tmp_path / "partial").write(start, *(plane[start:stop] for plane in written))
+        ProductRows(tmp_path / "partial").write(ProductStrip(start, *(plane[start:stop] for plane in written)))
     complete_product(tmp_path / "partial", tmp_path / "a.zarr")
     assert [path.name for path in tmp_path.iterdir()] == ["a.zarr"]
     np.testing.assert_array_equal(read_product(tmp_path / "a.zarr").height(0, ROWS), written[1])

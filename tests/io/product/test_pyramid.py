@@ -12,11 +12,13 @@ import torch
 import zarr
 
 from lsvision.errors import FileFormatError
-from lsvision.io import ProductLayout, ProductRows, ProductWriter, check_product, create_product, read_product
+from lsvision.io import ProductLayout, ProductRows, check_product, create_product, product_writer, read_product
 from lsvision.io.product.pyramid import halve, level_count, level_shape
+from lsvision.types import ProductGrid, ProductStrip
 
 ROWS, COLUMNS = 1100, 1030
-LAYOUT = ProductLayout((ROWS, COLUMNS), 0.28, (-3.5, 120.25), 3, torch.uint8, 256, {"scan": "A"}, uncertainty=True)
+GRID = ProductGrid(ROWS, COLUMNS, 0.28, -3.5, 120.25)
+LAYOUT = ProductLayout(GRID, 3, torch.uint8, 256, {"scan": "A"}, uncertainty=True)
 
 
 def planes() -> list[torch.Tensor]:
@@ -30,9 +32,9 @@ def planes() -> list[torch.Tensor]:
 def product(tmp_path_factory: pytest.TempPathFactory) -> Path:
     torch.manual_seed(0)
     path, written = tmp_path_factory.mktemp("pyramid") / "a.zarr", planes()
-    with ProductWriter(path, LAYOUT) as writer:
+    with product_writer(path, LAYOUT) as writer:
         for row in range(0, ROWS, 256):
-            writer.write(row, *(plane[row : row + 256] for plane in written))
+            writer.write(ProductStrip(row, *(plane[row : row + 256] for plane in written)))
     return path
 
 
@@ -71,17 +73,17 @@ def test_chunks_of_strips_are_never_shared(product: Path) -> None:
     root = zarr.open_group(product, mode="r")
     assert [root[f"height/{level}"].chunks for level in range(3)] == [(256, 1030), (128, 515), (64, 258)]
     with pytest.raises(ValueError, match=r"whole groups of 4 rows, got 2\.\.6"):
-        ProductRows(product).write(2, *(plane[2:6] for plane in planes()))
+        ProductRows(product).write(ProductStrip(2, *(plane[2:6] for plane in planes())))
 
 
 def test_sigma_is_written_where_it_was_planned(product: Path, tmp_path: Path) -> None:
     assert read_product(product).has_sigma
     assert read_product(product).sigma(3, 9).shape == (6, COLUMNS, 3)
     with pytest.raises(ValueError, match="sigma: the product needs it"):
-        ProductRows(product).write(0, *(plane[:4] for plane in planes()[:4]))
-    rows = create_product(tmp_path, ProductLayout((8, 9), 1.0, (0.0, 0.0), 3, torch.uint8, 8, {}))
+        ProductRows(product).write(ProductStrip(0, *(plane[:4] for plane in planes()[:4])))
+    rows = create_product(tmp_path, ProductLayout(ProductGrid(8, 9, 1.0, 0.0, 0.0), 3, torch.uint8, 8, {}))
     with pytest.raises(ValueError, match="sigma: the product has none"):
-        rows.write(0, *(plane[:8, :9] for plane in planes()))
+        rows.write(ProductStrip(0, *(plane[:8, :9] for plane in planes())))
 
 
 @pytest.mark.parametrize("name", ["color", "height", "valid", "source", "sigma"])
@@ -135,20 +137,20 @@ def misplace(product: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("harm", "told"),
+    ("harm", "message"),
     [
         (flip_a_bit, "color/1: rows 256-383: damaged"),
         (lose_a_chunk, "source/0: 1 of 5 chunks are missing"),
         (shorten_a_chunk, "height/0: rows 256-511: damaged"),
-        (contradict, "valid: rows 512-767: heights where there are none"),
+        (contradict, "valid: rows 512-767: heights of cells that are invalid"),
         (misplace, r"color\.ome: the metadata do not describe"),
     ],
 )
 def test_every_fault_is_found_and_placed(
-    product: Path, tmp_path: Path, harm: Callable[[Path], None], told: str
+    product: Path, tmp_path: Path, harm: Callable[[Path], None], message: str
 ) -> None:
     harmed = tmp_path / "a.zarr"
     shutil.copytree(product, harmed)
     harm(harmed)
-    with pytest.raises(FileFormatError, match=told):
+    with pytest.raises(FileFormatError, match=message):
         check_product(harmed)

@@ -1,0 +1,85 @@
+"""The archive of one scan, worked through in this process."""
+
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+from lsvision.archive.driver import Progress, process_scans
+from lsvision.archive.engines.in_process import InProcessEngine
+from lsvision.archive.identity import key_of, stamp_of
+from lsvision.archive.job import WORK_FOLDER, Place
+from lsvision.archive.ledger import LEDGER_FILE, Ledger, measured_cells
+from lsvision.archive.lock import sole_run
+from lsvision.archive.planned import PlannedScan, Processing, plan_scan
+from lsvision.archive.product import product_path
+from lsvision.archive.sources.calibrations import read_calibrations
+from lsvision.archive.sources.catalogue import SCAN_FILE, Found
+from lsvision.errors import LsvisionError
+from lsvision.io import MeasuredCells
+
+
+@dataclass(frozen=True)
+class FinishedProduct:
+    """A product on disk and the cells that were measured of it."""
+
+    path: Path
+    measured: MeasuredCells
+
+
+def plan_one(scan: Path | str, calibration: Path | str, processing: Processing) -> PlannedScan:
+    """Plan the product of one scan, which is named after its folder.
+
+    Args:
+        scan: the scan's folder, or its ``scan.yaml``.
+        calibration: its calibration, or a folder of several to choose from by rig and date.
+
+    Raises:
+        LsvisionError: see ``plan_scan`` and ``read_calibrations``.
+    """
+    folder = Path(scan).parent if Path(scan).name == SCAN_FILE else Path(scan)
+    found = Found(folder.resolve().name, folder.absolute())
+    stamp_of(found.path)  # of two missing files, the scan is named first
+    return plan_scan(found, read_calibrations(calibration), processing)
+
+
+def process_one(planned: PlannedScan, processing: Processing, output: Path, progress: Progress) -> FinishedProduct:
+    """Make the product of one scan in this process, on as many threads as torch may use.
+
+    The ledger and everything else but the product is hidden in the output while the work goes on, and removed at its
+    end. A run that was interrupted leaves it, and the same run goes on from there.
+
+    Args:
+        progress: called with every finished task and its outcome.
+
+    Raises:
+        LsvisionError: the product cannot be made; nothing of it is left.
+    """
+    work = output / WORK_FOLDER / f"correct-{key_of(planned.files.path)[:16]}"
+    lock = work.with_suffix(".lock")
+    with sole_run(output, lock), _temporary(work, lock):
+        with Ledger(work / LEDGER_FILE) as ledger, InProcessEngine() as engine:
+            place = Place(ledger, output, work, processing, keep_depth=False)
+            (row,) = process_scans([planned], engine, place, progress)
+            measured = measured_cells(strip for strip in ledger.strips(planned.key) if strip.stage == "product")
+        if row.status == "failed":
+            raise LsvisionError(row.error)
+    return FinishedProduct(product_path(output, planned.key), measured)
+
+
+@contextmanager
+def _temporary(folder: Path, lock: Path) -> Iterator[None]:
+    """Create a folder for the block and remove it and its lock after it; an interrupted block leaves the folder."""
+    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        yield
+    except LsvisionError:
+        shutil.rmtree(folder, ignore_errors=True)
+        raise
+    else:
+        shutil.rmtree(folder, ignore_errors=True)
+    finally:
+        with suppress(OSError):  # where open files cannot be removed, or others work beside it
+            lock.unlink()
+            folder.parent.rmdir()

@@ -1,0 +1,140 @@
+"""One scan as it will be processed: its files, its calibration, and the grid and strips of its product."""
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+
+from lsvision.archive.identity import ScanFiles, key_of, options_without_strips, stamp_of
+from lsvision.archive.sources.calibrations import DatedCalibration, calibration_for
+from lsvision.archive.sources.catalogue import Found
+from lsvision.errors import FileFormatError
+from lsvision.io import read_scan
+from lsvision.stages.correction.config import CorrectionConfig
+from lsvision.stages.correction.grid import plan_product
+from lsvision.stages.disparity.config import DisparityConfig
+from lsvision.stages.disparity.match import disparity_range
+from lsvision.types import ProductGrid, Scan, StereoPair
+
+# Peak of a worker over an idle one, as measured; an idle one holds torch, OpenCV and the decoded ends of its files.
+IDLE_BYTES = 500 * 2**20
+_CORRECTION_BYTES_PER_PX = 120
+_MATCHING_BYTES_PER_PX = 120
+_COST_BYTES_PER_PX = 64  # and disparity: the matcher keeps the costs of a few lines over the whole range
+_MIN_ROWS = 32
+
+
+@dataclass(frozen=True)
+class Processing:
+    """What is done to every scan, and the memory that a worker may take for it; None where it is not bounded."""
+
+    disparity: DisparityConfig
+    correction: CorrectionConfig
+    repair_encoder: bool
+    worker_memory_mb: int | None
+
+    @property
+    def with_sigma(self) -> bool:
+        """Whether the standard deviation of the matched depth is kept with it."""
+        return self.correction.uncertainty and self.disparity.tells_sigma
+
+    @property
+    def sha256(self) -> str:
+        """Hash of the options that products depend on; the height of strips of rows is not part of it."""
+        return key_of(asdict(self.disparity), options_without_strips(self.correction), self.repair_encoder)
+
+
+@dataclass(frozen=True)
+class PlannedScan:
+    """A scan that can be processed.
+
+    ``matched`` says whether its depth has to be matched, ``cell_bytes`` is the size of a cell of its product, and
+    ``correction`` has the strips that fit the memory of a worker.
+    """
+
+    key: str
+    files: ScanFiles
+    lines: int
+    width: int
+    matched: bool
+    cell_bytes: int
+    calibration: DatedCalibration
+    grid: ProductGrid
+    correction: CorrectionConfig
+
+    @property
+    def product_strips(self) -> int:
+        """Number of strips of its product."""
+        return -(-self.grid.rows // self.correction.strip_rows)
+
+
+def plan_scan(found: Found, calibrations: Sequence[DatedCalibration], processing: Processing) -> PlannedScan:
+    """Read a scan, but not its images, and plan its product.
+
+    Raises:
+        FileFormatError: the scan cannot be read, or not be processed in a worker's memory.
+        CalibrationError: no calibration fits it, or more than one does.
+        ConfigError: the pitch of the product is not positive.
+    """
+    if found.problem is not None:
+        raise FileFormatError(found.path, found.problem)
+    stamp = stamp_of(found.path)
+    scan = read_scan(found.path, repair_encoder=processing.repair_encoder)
+    calibration = calibration_for(scan, calibrations)
+    grid = plan_product(scan, calibration.calibration.motion, processing.correction)
+    return PlannedScan(
+        key=found.key,
+        files=ScanFiles(str(found.path), stamp, processing.repair_encoder),
+        lines=scan.lines,
+        width=scan.rig.width_px,
+        matched=isinstance(scan.images, StereoPair),
+        cell_bytes=scan.left.shape[2] * scan.left.dtype.itemsize + 13,  # height 4, valid 1, source 8
+        calibration=calibration,
+        grid=grid,
+        correction=replace(processing.correction, strip_rows=_strip_rows(scan, grid, processing)),
+    )
+
+
+def rows_for_memory(width: int, halo_lines: int, most: int, memory_bytes: int) -> int:
+    """Rows of a product that a worker can compute at once: ``most`` if they fit, else a power of two times the minimum.
+
+    Args:
+        halo_lines: lines that every strip reads beyond its rows.
+
+    Raises:
+        ValueError: not even the minimum fits.
+    """
+    room = (memory_bytes - IDLE_BYTES) // (_CORRECTION_BYTES_PER_PX * width) - halo_lines
+    rows = min(_MIN_ROWS, most)
+    if room < rows:
+        needed = IDLE_BYTES + (rows + halo_lines) * width * _CORRECTION_BYTES_PER_PX
+        raise ValueError(
+            f"a worker needs {needed >> 20} MB for {rows} rows of {width} px, it may take {memory_bytes >> 20} MB"
+        )
+    if room >= most:
+        return most
+    while 2 * rows <= room:
+        rows *= 2
+    return rows
+
+
+def _strip_rows(scan: Scan, grid: ProductGrid, processing: Processing) -> int:
+    """Rows of a product's strips; checks that matching fits the memory of a worker too."""
+    most = processing.correction.strip_rows
+    if processing.worker_memory_mb is None:
+        return most
+    memory_bytes = processing.worker_memory_mb * 2**20
+    needed = _matching_bytes(scan, processing.disparity) if isinstance(scan.images, StereoPair) else 0
+    if needed > memory_bytes:
+        problem = f"matching its strips needs {needed >> 20} MB, a worker may take {processing.worker_memory_mb} MB"
+        raise FileFormatError(scan.path, problem)
+    halo = max(grid.rows - scan.lines, 0)  # the skew of a line, which every strip has to read beyond its rows
+    try:
+        return rows_for_memory(scan.rig.width_px, halo, most, memory_bytes)
+    except ValueError as error:
+        raise FileFormatError(scan.path, str(error)) from error
+
+
+def _matching_bytes(scan: Scan, config: DisparityConfig) -> int:
+    low, high = disparity_range(scan.rig, config)
+    resolved = config.for_width(scan.rig.width_px)
+    lines = resolved.block_lines + 2 * (resolved.halo_lines or 0)
+    return IDLE_BYTES + scan.rig.width_px * (lines * _MATCHING_BYTES_PER_PX + _COST_BYTES_PER_PX * (high - low))

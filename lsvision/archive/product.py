@@ -1,0 +1,87 @@
+"""The product of a scan of an archive: where it lies, how it is laid out, and whether it is whole."""
+
+from dataclasses import asdict
+from pathlib import Path
+
+from lsvision import __version__
+from lsvision.archive.planned import PlannedScan, Processing
+from lsvision.errors import FileFormatError
+from lsvision.geometry import ProductFrame, zero_disparity_mm
+from lsvision.io import ProductLayout, check_product, read_product, read_scan
+
+
+def product_path(output: Path, key: str) -> Path:
+    """Where the product of a scan lies."""
+    return output / f"{key}.zarr"
+
+
+def product_layout(planned: PlannedScan, processing: Processing, input_sha256: str, key: str) -> ProductLayout:
+    """Layout of a scan's product, one chunk per strip; its metadata say everything that it was made from.
+
+    Args:
+        input_sha256: hash of the scan's files.
+        key: hash of everything that the product depends on.
+
+    Raises:
+        FileFormatError: the scan cannot be read any more.
+    """
+    scan = read_scan(planned.files.path, repair_encoder=processing.repair_encoder)
+    motion = planned.calibration.calibration.motion
+    return ProductLayout(
+        grid=planned.grid,
+        channels=scan.left.shape[2],
+        dtype=scan.left.dtype,
+        chunk_rows=planned.correction.strip_rows,
+        metadata={
+            "scan": planned.files.path,
+            "input_sha256": input_sha256,
+            "version": __version__,
+            "n": motion.n.tolist(),
+            "zero_disparity_mm": zero_disparity_mm(scan.rig),
+            "height_datum_mm": ProductFrame(scan.rig, scan.travel, motion.n).height_datum_mm,
+            "attributes": dict(scan.attributes),
+            "calibration": str(planned.calibration.path),
+            "calibration_sha256": planned.calibration.sha256,
+            "disparity": asdict(processing.disparity),
+            "correction": asdict(planned.correction),
+            "key": key,
+        },
+        uncertainty=planned.correction.uncertainty,
+    )
+
+
+def check_own(target: Path, planned: PlannedScan, input_sha256: str) -> None:
+    """Check that the product which a scan's product will replace, if any, is of the same scan.
+
+    It is if it was made from the same path, though the files have changed, or from the same files, though they have
+    moved.
+
+    Raises:
+        FileFormatError: it is of another scan.
+    """
+    try:
+        metadata = read_product(target).metadata
+    except FileFormatError:  # nothing there, or what ``complete_product`` does not replace
+        return
+    other = metadata.get("scan")
+    moved = metadata.get("input_sha256") == input_sha256
+    if not moved and isinstance(other, str) and Path(other).resolve() != Path(planned.files.path).resolve():
+        raise FileFormatError(target, f"the product of another scan, {other}; choose another output")
+
+
+def is_finished(target: Path | str, key: str) -> bool:
+    """Whether the product of this key has its final name already."""
+    try:
+        return read_product(target).metadata.get("key") == key
+    except FileFormatError:
+        return False
+
+
+def damage_of(path: str, measured_cells: int) -> str:
+    """What is wrong with a product on disk, in words; empty where it reads and has the cells it was written with."""
+    try:
+        check = check_product(path)
+    except FileFormatError as error:
+        return str(error)
+    found = round(check.valid_share * check.rows * check.columns)
+    return "" if found == measured_cells else f"{path}: expected {measured_cells} measured cells, found {found}"

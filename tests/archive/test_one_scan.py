@@ -1,0 +1,107 @@
+"""One scan: the same product as from an archive, byte for byte, and never in the place of another scan's."""
+
+from pathlib import Path
+
+import pytest
+
+from lsvision.archive import EngineConfig, plan_one, process_one
+from lsvision.archive.work import CorrectStrip
+from lsvision.errors import LsvisionError, ScansFailedError
+from lsvision.experiments.correct import CorrectSettings, run_correct
+from lsvision.experiments.reprocess import ReprocessSettings, run_reprocess
+from lsvision.io import read_product
+from tests.archive.archives import PROCESSING, assert_same_products, make_calibration, make_scan, with_strip_rows
+
+
+def correct(scan: Path, calibration: Path, output: Path) -> None:
+    settings = CorrectSettings(
+        name="correct",
+        scan=str(scan),
+        calibration=str(calibration),
+        output=str(output),
+        disparity=PROCESSING.disparity,
+        correction=PROCESSING.correction,
+    )
+    run_correct(settings, output.with_name(f"{output.name}-run"))
+
+
+def reprocess(archive: Path, calibration: Path, output: Path) -> None:
+    settings = ReprocessSettings(
+        name="reprocess",
+        archive=str(archive),
+        calibration=str(calibration),
+        output=str(output),
+        engine=EngineConfig(workers=1),
+        disparity=PROCESSING.disparity,
+        correction=PROCESSING.correction,
+    )
+    run_reprocess(settings, output.with_name(f"{output.name}-run"))
+
+
+def ignore(task: object, outcome: object) -> None:
+    pass
+
+
+def content(folder: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+@pytest.mark.parametrize("name", ["a", "b"])
+def test_correct_and_reprocess_make_the_same_files(archive, calibration, tmp_path, monkeypatch, name):
+    monkeypatch.chdir(archive.parent)
+    correct(archive.relative_to(archive.parent) / name, calibration, tmp_path / "one")
+    reprocess(archive / name, calibration, tmp_path / "many")
+    one, many = content(tmp_path / "one" / f"{name}.zarr"), content(tmp_path / "many" / f"{name}.zarr")
+    assert len(one) > 10
+    assert one == many
+    assert [path.name for path in (tmp_path / "one").iterdir()] == [f"{name}.zarr"]
+
+
+@pytest.mark.parametrize("recorded_strips", [0, 3])
+def test_an_interrupted_run_goes_on_where_it_stood(archive, calibration, tmp_path, monkeypatch, recorded_strips):
+    processing, run, strips = with_strip_rows(16), CorrectStrip.run, []
+    planned = plan_one(archive / "b", calibration, processing)
+    left = iter(range(1 + recorded_strips))  # the hash of the files comes first
+
+    def interrupt(task, outcome):
+        if next(left, None) is None:
+            raise KeyboardInterrupt
+
+    def noted(work):
+        strips.append(work.number)
+        return run(work)
+
+    monkeypatch.setattr(CorrectStrip, "run", noted)
+    with pytest.raises(KeyboardInterrupt):
+        process_one(planned, processing, tmp_path / "o", interrupt)
+    assert strips == list(range(recorded_strips + 1))
+    assert [path.name for path in (tmp_path / "o").iterdir()] == [".work"]
+    strips.clear()
+    process_one(planned, processing, tmp_path / "o", ignore)
+    assert strips == list(range(recorded_strips, planned.product_strips))
+    assert [path.name for path in (tmp_path / "o").iterdir()] == ["b.zarr"]
+    process_one(planned, processing, tmp_path / "undisturbed", ignore)
+    assert_same_products(tmp_path / "undisturbed", tmp_path / "o")
+
+
+def test_a_product_is_replaced_by_one_of_the_same_scan_only(calibration, tmp_path):
+    for folder, seed in (("one", 1), ("other", 2)):
+        make_scan(tmp_path / folder / "rail", 96, seed)
+    correct(tmp_path / "one" / "rail", calibration, tmp_path / "o")
+    before = content(tmp_path / "o")
+    with pytest.raises(LsvisionError, match=r"rail\.zarr: the product of another scan, .*one/rail; choose another"):
+        correct(tmp_path / "other" / "rail", calibration, tmp_path / "o")
+    with pytest.raises(ScansFailedError):
+        reprocess(tmp_path / "other", calibration, tmp_path / "o")
+    assert content(tmp_path / "o" / "rail.zarr") == {name[10:]: data for name, data in before.items()}
+    make_scan(tmp_path / "one" / "rail", 96, 3)  # the same scan, taken anew
+    correct(tmp_path / "one" / "rail", calibration, tmp_path / "o")
+    (tmp_path / "one" / "rail").rename(tmp_path / "rail")  # the same scan, moved
+    correct(tmp_path / "rail", make_calibration(tmp_path / "n.json", (0.0, 1.0, 0.0)), tmp_path / "o")
+    assert read_product(tmp_path / "o" / "rail.zarr").metadata["n"] == [0.0, 1.0, 0.0]
+
+
+def test_a_scan_file_stands_for_its_folder(archive, calibration, tmp_path):
+    planned = plan_one(archive / "a" / "scan.yaml", calibration, PROCESSING)
+    assert planned.files == plan_one(archive / "a", calibration, PROCESSING).files
+    assert process_one(planned, PROCESSING, tmp_path, ignore).path == tmp_path / "a.zarr"
