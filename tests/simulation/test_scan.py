@@ -115,8 +115,8 @@ def test_rail_depth_is_its_profile_along_the_motion(coarse, board, clean):
     simulation = simulate(coarse, board, scene, MotionConfig(1.0, -2.0), clean, Acquisition(PITCH, lines=90))
     depth = torch.cat(list(simulation.depth_strips()))
     torch.testing.assert_close(depth[70], depth[5], rtol=0, atol=2e-3)  # nothing changes along a sound, still rail
-    # The rise is a height, measured along e_z.
-    crown = zero_disparity_mm(coarse) - scene.rail_rise_mm * float(aligned_rotation(simulation.trajectory.n)[2, 2])
+    # The rise is a height, measured at right angles to the motion; within the scan plane it is longer.
+    crown = zero_disparity_mm(coarse) - scene.rail_rise_mm / float(aligned_rotation(simulation.trajectory.n)[2, 2])
     torch.testing.assert_close(float(depth.min()), crown, rtol=0, atol=0.01)
     assert (depth.max() - depth.min()) < 52.0
     faulty = dataclasses.replace(scene, defect_spacing_mm=60.0)
