@@ -17,24 +17,24 @@ import torch
 
 from lsvision.archive import (
     LEDGER_FILE,
+    WORK_FOLDER,
     Engine,
     Ledger,
     LocalEngine,
     Place,
     Processing,
+    Task,
     find_scans,
     plan_run,
+    process_scans,
     read_calibrations,
-    run_jobs,
-    scan_job,
 )
 from lsvision.archive.engines.dask import DaskEngine
-from lsvision.archive.tasks import Task, TaskResult
 from lsvision.image.tiling import keep_freed_memory
 from lsvision.io import (
     NewScan,
     ProductLayout,
-    ProductWriter,
+    product_writer,
     read_calibration,
     read_scan,
     write_calibration,
@@ -60,10 +60,10 @@ class Usage:
 
     number: int
 
-    def run(self) -> TaskResult:
+    def run(self) -> tuple[int, float]:
         """Ask the system."""
         used = resource.getrusage(resource.RUSAGE_SELF)
-        return TaskResult(measured=used.ru_maxrss, value=str(used.ru_utime + used.ru_stime))
+        return used.ru_maxrss, used.ru_utime + used.ru_stime
 
 
 def make_archive(root: Path) -> Path:
@@ -90,13 +90,10 @@ def bare(archive: Path, calibration: Path, output: Path) -> float:
     for found in find_scans(str(archive)):
         scan = read_scan(found.path)
         grid = plan_product(scan, motion, config)
-        layout = ProductLayout(
-            (grid.rows, grid.columns), grid.pitch_mm, (grid.origin_y_mm, grid.origin_x_mm), 3, torch.uint8,
-            config.strip_rows, {},
-        )  # fmt: skip
-        with ProductWriter(output / f"{found.key}.zarr", layout) as writer:
+        layout = ProductLayout(grid, 3, torch.uint8, config.strip_rows, {})
+        with product_writer(output / f"{found.key}.zarr", layout) as writer:
             for strip in correct_scan(scan, depth_of(scan, PROCESSING.disparity), motion, config, grid):
-                writer.write(strip.row, strip.color, strip.height, strip.valid, strip.source)
+                writer.write(strip)
     return time.perf_counter() - begin
 
 
@@ -106,8 +103,7 @@ def through(engine: Engine, archive: Path, calibration: Path, output: Path) -> f
     begin = time.perf_counter()
     with Ledger(output / LEDGER_FILE) as ledger:
         plan = plan_run(find_scans(str(archive)), read_calibrations(calibration), PROCESSING, {}, output)
-        place = Place(ledger, output, PROCESSING, False)
-        rows = run_jobs([(s.key, scan_job(s, place)) for s in plan.to_do], engine, place, lambda task, result: None)
+        rows = process_scans(plan.to_do, engine, Place(ledger, output, output / WORK_FOLDER, PROCESSING))
     if any(row.status != "done" for row in rows):
         raise RuntimeError(f"not every scan was done: {rows}")
     return time.perf_counter() - begin
@@ -117,10 +113,10 @@ def usage(engine: Engine, workers: int) -> tuple[int, float]:
     """Peak memory, MB, of the workers so far, and the processor seconds of the first worker and this process."""
     for number in range(workers):
         engine.submit(Task("usage", Usage(number)))
-    found: list[TaskResult] = []
+    found: list[tuple[int, float]] = []
     while len(found) < workers:
-        found += [result for _, result in engine.collect()]
-    return max(result.measured for result in found) >> 10, float(found[0].value) + time.process_time()
+        found += [outcome.result for _, outcome in engine.collect()]
+    return max(memory for memory, _ in found) >> 10, found[0][1] + time.process_time()
 
 
 @contextmanager
