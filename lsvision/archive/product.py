@@ -8,6 +8,8 @@ from lsvision.archive.planned import PlannedScan, Processing
 from lsvision.errors import FileFormatError
 from lsvision.geometry import ProductFrame, zero_disparity_mm
 from lsvision.io import ProductLayout, check_product, read_product, read_scan
+from lsvision.io.atomic import check_replaceable
+from lsvision.io.product.layout import ROOT_METADATA
 
 
 def product_path(output: Path, key: str) -> Path:
@@ -51,21 +53,23 @@ def product_layout(planned: PlannedScan, processing: Processing, input_sha256: s
 
 
 def check_own(target: Path, planned: PlannedScan, input_sha256: str) -> None:
-    """Check that the product which a scan's product will replace, if any, is of the same scan.
+    """Check that a scan's product will replace none but an earlier product of the same scan.
 
-    It is if it was made from the same path, though the files have changed, or from the same files, though they have
-    moved.
+    That was made from the same path, though the files have changed, or from the same files, though they have moved.
 
     Raises:
-        FileFormatError: it is of another scan.
+        FileFormatError: ``target`` holds the product of another scan, or something else.
     """
+    check_replaceable(target, ROOT_METADATA)
     try:
         metadata = read_product(target).metadata
-    except FileFormatError:  # nothing there, or what ``complete_product`` does not replace
+    except FileFormatError:  # nothing there, or the remains of a product
         return
     other = metadata.get("scan")
     moved = metadata.get("input_sha256") == input_sha256
-    if not moved and isinstance(other, str) and Path(other).resolve() != Path(planned.files.path).resolve():
+    # Early versions recorded relative paths, of which nothing is known any more.
+    known = isinstance(other, str) and Path(other).is_absolute()
+    if known and not moved and Path(str(other)).resolve() != Path(planned.files.path).resolve():
         raise FileFormatError(target, f"the product of another scan, {other}; choose another output")
 
 

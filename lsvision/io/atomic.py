@@ -56,7 +56,7 @@ def partial_folder(target: Path | str, *, marker: str) -> Iterator[Path]:
         WriteError: the disk is full.
     """
     target = Path(target).resolve()
-    _check_replaceable(target, marker)
+    check_replaceable(target, marker)
     target.parent.mkdir(parents=True, exist_ok=True)
     partial = _hidden_sibling(target)
     partial.mkdir()
@@ -68,6 +68,16 @@ def partial_folder(target: Path | str, *, marker: str) -> Iterator[Path]:
         shutil.rmtree(partial, ignore_errors=True)
 
 
+def check_replaceable(target: Path, marker: str) -> None:
+    """Check that nothing else can be lost where ``target`` is replaced; see ``partial_folder``.
+
+    Raises:
+        FileFormatError: ``target`` exists, is not empty and does not hold ``marker``.
+    """
+    if target.exists() and not (target.is_dir() and ((target / marker).is_file() or not any(target.iterdir()))):
+        raise FileFormatError(target, f"expected a new or empty folder, or one with {marker} to replace")
+
+
 def replace_folder(source: Path | str, target: Path | str, *, marker: str) -> None:
     """Give a finished folder its final name on the same file system; what ``target`` may hold: see ``partial_folder``.
 
@@ -75,7 +85,7 @@ def replace_folder(source: Path | str, target: Path | str, *, marker: str) -> No
         FileFormatError: ``target`` exists, is not empty and does not hold ``marker``.
     """
     target = Path(target).resolve()
-    _check_replaceable(target, marker)
+    check_replaceable(target, marker)
     target.parent.mkdir(parents=True, exist_ok=True)
     _take_over(Path(source), target)
 
@@ -96,11 +106,6 @@ def write_text(path: Path | str, text: str) -> None:
 def _hidden_sibling(target: Path) -> Path:
     # Beside the target, so that the rename stays within one file system; unique, so that two writers never meet.
     return target.with_name(f".{target.name}.{uuid.uuid4().hex}.partial")
-
-
-def _check_replaceable(target: Path, marker: str) -> None:
-    if target.exists() and not (target.is_dir() and ((target / marker).is_file() or not any(target.iterdir()))):
-        raise FileFormatError(target, f"expected a new or empty folder, or one with {marker} to replace")
 
 
 def _take_over(partial: Path, target: Path) -> None:

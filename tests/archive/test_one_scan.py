@@ -101,6 +101,15 @@ def test_a_product_is_replaced_by_one_of_the_same_scan_only(calibration, tmp_pat
     assert read_product(tmp_path / "o" / "rail.zarr").metadata["n"] == [0.0, 1.0, 0.0]
 
 
+def test_what_is_no_product_is_not_replaced_and_nothing_is_computed(archive, calibration, tmp_path, monkeypatch):
+    (tmp_path / "o" / "a.zarr").mkdir(parents=True)
+    (tmp_path / "o" / "a.zarr" / "notes.txt").write_text("keep")
+    monkeypatch.delattr(CorrectStrip, "run")
+    with pytest.raises(LsvisionError, match=r"a\.zarr: expected a new or empty folder, or one with zarr.json"):
+        correct(archive / "a", calibration, tmp_path / "o")
+    assert content(tmp_path / "o") == {"a.zarr/notes.txt": b"keep"}
+
+
 def test_a_scan_file_stands_for_its_folder(archive, calibration, tmp_path):
     planned = plan_one(archive / "a" / "scan.yaml", calibration, PROCESSING)
     assert planned.files == plan_one(archive / "a", calibration, PROCESSING).files
