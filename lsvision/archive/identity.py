@@ -33,12 +33,10 @@ def stamp_of(folder: Path) -> str:
         FileFormatError: ``scan.yaml`` cannot be read.
     """
     try:
-        states = [
-            (str(file), file.stat().st_size, file.stat().st_mtime_ns) for file in scan_files(folder) if file.exists()
-        ]
+        files = [(str(file), file.stat()) for file in scan_files(folder) if file.exists()]
     except OSError as error:
         raise FileFormatError(folder, f"cannot be read: {error.strerror}") from error
-    return key_of(states)
+    return key_of([(path, state.st_size, state.st_mtime_ns) for path, state in files])
 
 
 def depth_key(input_sha256: str, config: DisparityConfig, with_sigma: bool, version: str) -> str:

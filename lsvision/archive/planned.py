@@ -135,6 +135,6 @@ def _strip_rows(scan: Scan, grid: ProductGrid, processing: Processing) -> int:
 
 def _matching_bytes(scan: Scan, config: DisparityConfig) -> int:
     low, high = disparity_range(scan.rig, config)
-    resolved = config.for_width(scan.rig.width_px)
-    lines = resolved.block_lines + 2 * (resolved.halo_lines or 0)
+    config = config.for_width(scan.rig.width_px)
+    lines = config.block_lines + 2 * (config.halo_lines or 0)
     return IDLE_BYTES + scan.rig.width_px * (lines * _MATCHING_BYTES_PER_PX + _COST_BYTES_PER_PX * (high - low))

@@ -153,7 +153,7 @@ class FinishProduct:
         working, final = self.product.working, self.product.final
         remove_partial_siblings(final)
         if not Path(working).is_dir() and is_finished(final, self.key):
-            return  # by a worker that died before its result was recorded
+            return  # by a worker that crashed before its outcome was known
         remove_partial_chunks(working)
         if self.verify and (damage := damage_of(working, self.measured_cells)):
             raise LsvisionError(damage)

@@ -24,7 +24,7 @@ REASONS = {
     "wrong width": r"scan.yaml: left: expected 64 columns as the rig has, got 60",
     "unreadable yaml": r"scan.yaml: expected plain YAML",
     "other rig": r"the calibration is for another rig: baseline_mm",
-    "no permission": r"(Permission denied|cannot be looked into)",
+    "no permission": r"(Permission denied|cannot be read)",
     "zero lines": r"left.zarr: expected an image, got 0 lines of 64 px",
     "nan pitch": r"scan.yaml: line_pitch_mm: expected a finite number",
     "python tag": r"scan.yaml: expected plain YAML",

@@ -4,6 +4,7 @@ import logging
 import multiprocessing
 import os
 import signal
+import sys
 import threading
 from collections import deque
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
@@ -34,6 +35,7 @@ class LocalEngine:
     def __init__(self, workers: int, start_method: StartMethod | None = None) -> None:
         if start_method is None:
             start_method = "forkserver" if "forkserver" in multiprocessing.get_all_start_methods() else "spawn"
+        _forget_stdin()
         self._context = multiprocessing.get_context(start_method)
         if start_method == "forkserver":
             self._context.set_forkserver_preload(["__main__", "lsvision.archive.tasks"])
@@ -125,6 +127,13 @@ class LocalEngine:
     def _start_worker(self) -> None:
         pool = ProcessPoolExecutor(1, mp_context=self._context, initializer=_enter_worker)
         self._busy[pool.submit(os.getpid)] = None, pool
+
+
+def _forget_stdin() -> None:
+    """A program read from standard input claims a file, which workers would try to import."""
+    main = sys.modules["__main__"]
+    if getattr(main, "__file__", None) == "<stdin>":
+        del main.__file__
 
 
 def _enter_worker() -> None:

@@ -29,7 +29,7 @@ class ListedCalibration(Checked):
 
 @dataclass(frozen=True)
 class DatedCalibration:
-    """A calibration, the hash of its file, and the days it holds for, both included; None is open."""
+    """A calibration, the hash of its file, and its first and last day; None where it has none."""
 
     path: Path
     calibration: Calibration
@@ -38,7 +38,7 @@ class DatedCalibration:
     last: date | None = None
 
     def holds_on(self, day: date) -> bool:
-        """Whether a day lies within the days it holds for."""
+        """Whether a day lies within its days."""
         return (self.first is None or self.first <= day) and (self.last is None or day <= self.last)
 
 

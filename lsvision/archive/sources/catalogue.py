@@ -8,14 +8,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from lsvision.errors import ConfigError
+from lsvision.io.formats.scan import SCAN_FILE
 
-SCAN_FILE = "scan.yaml"
 PATTERN_SIGNS = "*?["
 
 
 @dataclass(frozen=True)
 class Found:
-    """A place of the archive: a scan, or what keeps it from being looked into.
+    """A place of the archive: a scan, or the problem that keeps it from being read.
 
     ``key`` names the scan within the archive, its path from the archive's root; its product lies at the same path below
     the output.
@@ -30,9 +30,9 @@ def find_scans(archive: str, skip: Path | None = None) -> list[Found]:
     """All scans of an archive, each folder once, in natural reading order of their keys.
 
     Args:
-        archive: a folder, every scan below which is meant; a text file with the path of one scan folder a line, from
-            the file's own folder; or a pattern with ``*``, ``?``, ``[..]`` or ``**`` that scan folders match.
-        skip: a folder not to look into, where products are written.
+        archive: a folder that holds the scans, however deep; a text file with the path of one scan folder per line,
+            relative to the file's folder; or a pattern with ``*``, ``?``, ``[..]`` or ``**`` that scan folders match.
+        skip: a folder to leave out, where products are written.
 
     Raises:
         ConfigError: there is no such folder or file.
@@ -63,7 +63,7 @@ def find_scans(archive: str, skip: Path | None = None) -> list[Found]:
 
 
 def _walk(root: Path, skip: Path | None) -> Iterator[tuple[Path, str | None]]:
-    """Scan folders below a folder and what could not be looked into; links are followed, but never round in circles."""
+    """Scan folders below a folder, and places that cannot be read; links are followed, but never round in circles."""
     pending: list[tuple[Path, tuple[Path, ...]]] = [(root, (root.resolve(),))]
     while pending:
         folder, above = pending.pop()
@@ -101,7 +101,7 @@ def _check_link(entry: os.DirEntry[str]) -> None:
 def _in_words(error: OSError) -> str:
     if error.errno == errno.ELOOP:
         return "a symbolic link that loops back to itself"
-    return f"cannot be looked into: {error.strerror}"
+    return f"cannot be read: {error.strerror}"
 
 
 def _common_root(places: list[Path]) -> Path:

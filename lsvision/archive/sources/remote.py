@@ -15,7 +15,7 @@ from lsvision.errors import ConfigError
 from lsvision.io import write_json
 
 _MANIFEST = ".copied.json"
-# What tells cheaply that a file has changed; every file system knows some of them.
+# What changes with a file, cheap to ask for; every file system knows some of them.
 _STAMPS = ("size", "ETag", "etag", "mtime", "LastModified", "last_modified", "modified", "created")
 
 
@@ -23,8 +23,8 @@ def local_archive(archive: str, copies: Path) -> str:
     """The archive as ``find_scans`` takes it: a URL's scans copied below a folder, anything else as it is.
 
     Args:
-        archive: ``s3://bucket/2024-*/*``, say: a folder, or a pattern that scan folders match. The protocol may need a
-            package of its own (s3fs, gcsfs, ..).
+        archive: a folder, or a pattern that scan folders match, as ``s3://bucket/2024-*/*``. The protocol may need
+            another package (s3fs, gcsfs, ..).
         copies: folder of the copies, which mirror the archive. Files that are there and unchanged stay; what the
             archive no longer has is removed.
 
@@ -66,7 +66,7 @@ def _copy(files: fsspec.AbstractFileSystem, place: str, copies: Path) -> None:
 
 
 def _stamps(files: fsspec.AbstractFileSystem, scans: list[str]) -> Iterator[tuple[str, str]]:
-    """Every file of some scans, the rigs beside them too, and what tells that it has changed."""
+    """Every file of some scans, the rigs beside them too, and a text that changes with it."""
     for scan in scans:
         folder = posixpath.dirname(scan)
         found: dict[str, dict[str, Any]] = files.find(folder, detail=True)
@@ -81,6 +81,6 @@ def _rig_beside(files: fsspec.AbstractFileSystem, scan: str) -> str | None:
     try:
         values = yaml.safe_load(files.cat_file(scan))
     except yaml.YAMLError:
-        return None  # told where the scan is read
+        return None  # reported where the scan is read
     rig = values.get("rig") if isinstance(values, dict) else None
     return posixpath.normpath(posixpath.join(posixpath.dirname(scan), rig)) if isinstance(rig, str) else None
