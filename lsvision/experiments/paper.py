@@ -113,16 +113,15 @@ def _scenario(settings: PaperSettings, motion: MotionConfig, folder: Path, bars:
 
         products = map_names(pool, corrected, scans)
         checks = map_names(pool, lambda name: _check_board(settings.board, corners[name], products[name]), boards)
-    sheet, product = simulations["sheet"], products["sheet"]
-    strip = product.read(0, product.grid.rows)
-    color, height = TensorImage(strip.color), TensorImage(strip.height[..., None])
+    sheet = simulations["sheet"]
+    color, height = _in_memory(products["sheet"])
     return Scenario(
         n_true=sheet.trajectory.n,
         results={"joint": joint, "two_step": two_step},
         boards=corners,
         checks=checks,
         sheet_before=points_in_scan(scans["sheet"], depth_of(scans["sheet"], settings.disparity), sheet),
-        sheet_after=points_in_product(color, height, product.grid, joint.motion.n, sheet),
+        sheet_after=points_in_product(color, height, products["sheet"].grid, joint.motion.n, sheet),
         scans=scans,
         products=products,
     )
@@ -153,8 +152,7 @@ def _check_board(board: Board, corners: BoardCorners, product: Product) -> Board
     """Distances between a board's corners at nominal motion and in the product."""
     nominal = displace(corners.points, corners.points.new_tensor([0.0, 1.0, 0.0]))
     neighbours_mm, pairs_mm = distance_errors(nominal, board, corners.valid)
-    strip = product.read(0, product.grid.rows)
-    color, height = TensorImage(strip.color), TensorImage(strip.height[..., None])
+    color, height = _in_memory(product)
     measured = measure_board(color, height, product.grid, board)
     if measured is None:
         return BoardCheck(0, neighbours_mm, pairs_mm)
@@ -166,3 +164,9 @@ def _check_board(board: Board, corners: BoardCorners, product: Product) -> Board
         pairs_after_mm=measured.distance_rms_mm,
         points=measured.points,
     )
+
+
+def _in_memory(product: Product) -> tuple[TensorImage, TensorImage]:
+    """Colour and height of a whole product."""
+    rows = product.grid.rows
+    return TensorImage(product.color(0, rows)), TensorImage(product.height(0, rows)[..., None])
