@@ -8,7 +8,7 @@ import polars
 
 from lsvision.experiments.settings import RunSettings
 from lsvision.io import write_json
-from lsvision.io.atomic import partial_file
+from lsvision.io.parquet import write_parquet
 from lsvision.report import Study, study_report
 from lsvision.schema import IntFrom2, Positive, PositiveInt, Text
 from lsvision.simulation import BoardPose
@@ -69,7 +69,7 @@ def run_study(settings: StudySettings, folder: Path) -> None:
         tilts=tilt_map(settings.rig, settings.board, points[0], settings.map_range_deg, settings.map_steps),
     )
     for name in ("runs", "points", "iterations"):
-        _write_parquet(getattr(study, name), folder / f"{name}.parquet")
+        write_parquet(getattr(study, name), folder / f"{name}.parquet")
     write_json(folder / "summary.json", _summary(study))
     study_report(study, asdict(settings), folder)
     log.info("wrote %s and runs, points and iterations as Parquet beside it", folder / "report.html")
@@ -84,8 +84,3 @@ def _summary(study: Study) -> dict:
         "median": study.points.select(polars.col(merits).median()).row(0, named=True),
         "results": study.points.select(*study.axes, *merits).to_dicts(),
     }
-
-
-def _write_parquet(table: polars.DataFrame, path: Path) -> None:
-    with partial_file(path) as partial:
-        table.write_parquet(partial)

@@ -18,7 +18,7 @@ from omegaconf import OmegaConf
 from lsvision.errors import ConfigError, LsvisionError
 from lsvision.experiments.settings import RunSettings
 from lsvision.io import write_json
-from lsvision.io.atomic import partial_file
+from lsvision.io.parquet import write_parquet
 from lsvision.report import SweepJob, sweep_report
 from lsvision.schema import PositiveInt, Text
 
@@ -72,12 +72,12 @@ def collect_sweep(folder: Path) -> list[SweepJob]:
         raise ConfigError(f"sweep: {folder} holds no jobs")
     jobs = [_read_job(path) for path in sorted(folders, key=lambda path: (len(path.name), path.name))]
     table = polars.DataFrame([_row(job) for job in jobs], infer_schema_length=None)
-    _write_parquet(table, folder / "sweep.parquet")
+    write_parquet(table, folder / "sweep.parquet")
     studies = [job for job in jobs if (folder / job.name / "points.parquet").is_file() and not job.reason]
     if studies:
         tables = [polars.read_parquet(folder / job.name / "points.parquet") for job in studies]
         rows = [rows.with_columns(polars.lit(job.name).alias("job")) for job, rows in zip(studies, tables, strict=True)]
-        _write_parquet(polars.concat(rows, how="diagonal_relaxed"), folder / "points.parquet")
+        write_parquet(polars.concat(rows, how="diagonal_relaxed"), folder / "points.parquet")
     sweep_report(jobs, folder)
     log.info(
         "%d of %d jobs succeeded; wrote %s", sum(not job.reason for job in jobs), len(jobs), folder / "report.html"
@@ -115,8 +115,3 @@ def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, float | str 
 def _reason(error: Exception) -> str:
     text = str(error).splitlines()[0] if str(error) else ""
     return text if isinstance(error, LsvisionError) else f"{type(error).__name__}: {text}"
-
-
-def _write_parquet(table: polars.DataFrame, path: Path) -> None:
-    with partial_file(path) as partial:
-        table.write_parquet(partial)

@@ -6,34 +6,18 @@ s / n2 of travel later and in another column (``ProductFrame.shifted_column``).
 
 import math
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
 
 from lsvision.geometry import ProductFrame
-from lsvision.image import resampling
-from lsvision.image.resampling import Interpolation, Resampler, sample_image, sampling_reach
+from lsvision.image.resampling import Sampling, sample_image, sampling_reach
+from lsvision.stages.correction.config import CorrectionConfig
 from lsvision.stages.correction.locate import SeenCells
 from lsvision.types import Scan
 
 _GREEN = 1
 _COARSE_FROM = 1.25  # distance of cells, in pixels, from which on smoothing does more good than harm
-
-
-@runtime_checkable
-class Sampling(Protocol):
-    """How colours are interpolated."""
-
-    @property
-    def interpolation(self) -> Interpolation:
-        """Bilinear or bicubic."""
-        ...
-
-    @property
-    def resampler(self) -> Resampler:
-        """The library that does it."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -43,7 +27,7 @@ class ColorLines:
     Attributes:
         start: the first of the lines.
         image_range: the lines of the image that ``sample`` needs, first and end.
-        coarser: distance of the samples in lines and columns where the image is to be smoothed first, else 1.
+        sampling: how they are interpolated.
         shift_mm: where each colour looks along Y, beyond green. rows: ``(channels, lines)``, float64: the image row in
             which a colour shows what green shows on each line. Both are None where all colours look at one line.
     """
@@ -51,18 +35,19 @@ class ColorLines:
     frame: ProductFrame
     start: int
     image_range: tuple[int, int]
-    coarser: tuple[float, float]
+    sampling: Sampling
     shift_mm: Tensor | None = None
     rows: Tensor | None = None
 
-    def sample(self, image: Tensor, seen: SeenCells, how: Sampling, out: Tensor) -> None:
+    def sample(self, image: Tensor, seen: SeenCells, out: Tensor) -> None:
         """Write the colours of cells, ``(rows, columns, channels)``, to ``out``.
 
         Args:
             image: the lines ``image_range`` of the left image.
         """
         if self.shift_mm is None or self.rows is None:
-            self._sample(image, seen.column, seen.line, how, out, seen.first_line - self.image_range[0])
+            first_line = seen.first_line - self.image_range[0]
+            sample_image(image, seen.column, seen.line, self.sampling, first_line=first_line, out=out)
             return
         begin = seen.first_line - self.start
         base = seen.line.nan_to_num().floor().clamp(-begin, self.rows.shape[1] - 2 - begin)
@@ -71,37 +56,28 @@ class ColorLines:
         for channel, (shift_mm, rows) in enumerate(zip(self.shift_mm, self.rows - self.image_range[0], strict=True)):
             row, into = torch.lerp(rows[base], rows[base + 1], part), torch.empty_like(out[..., :1])
             shifted = self.frame.shifted_column(column, relief, shift_mm)
-            self._sample(image[..., [channel]], shifted, row, how, into)
+            sample_image(image[..., [channel]], shifted, row, self.sampling, out=into)
             out[..., [channel]] = into
 
-    def _sample(
-        self, image: Tensor, column: Tensor, line: Tensor, how: Sampling, out: Tensor, first_line: int = 0
-    ) -> None:
-        sampling = resampling.Sampling(how.interpolation, how.resampler, self.coarser)
-        sample_image(image, column, line, sampling, first_line=first_line, out=out)
+
+def sampling_for(config: CorrectionConfig, spacing: tuple[float, float]) -> Sampling:
+    """How colours are interpolated for cells that lie ``spacing`` lines and columns of the scan apart."""
+    lines, columns = (distance if distance >= _COARSE_FROM else 1.0 for distance in spacing)
+    return Sampling(config.interpolation, config.resampler, (lines, columns))
 
 
-def color_lines(scan: Scan, frame: ProductFrame, lines: tuple[int, int], spacing: tuple[float, float]) -> ColorLines:
-    """Colours of the lines ``lines[0]..lines[1]-1``.
-
-    Args:
-        spacing: distance of the samples in lines and columns.
-    """
-    coarser = (_smoothed_over(spacing[0]), _smoothed_over(spacing[1]))
-    reach = sampling_reach(coarser[0])
+def color_lines(scan: Scan, frame: ProductFrame, lines: tuple[int, int], sampling: Sampling) -> ColorLines:
+    """Colours of the lines ``lines[0]..lines[1]-1``."""
+    reach = sampling_reach(sampling.coarser[0])
     shift = torch.tensor(scan.rig.color_spacing_lines, dtype=torch.float64)
     shift = shift - shift[_GREEN]
     if scan.left.shape[2] == 1 or not bool(shift.any()):
         image_range = max(lines[0] - reach, 0), min(lines[1] + reach, scan.lines)
-        return ColorLines(frame, lines[0], image_range, coarser)
+        return ColorLines(frame, lines[0], image_range, sampling)
     shift_mm = shift * scan.travel.line_pitch_mm
     rows = frame.shifted_line(torch.arange(*lines, dtype=torch.float64), shift_mm[:, None])
     if scan.color_registered:  # the camera has shifted each colour by as many rows
         rows = rows + (-1.0 if scan.travel.transport == "reverse" else 1.0) * shift[:, None]
     first, last = math.floor(float(rows.min())) - reach, math.ceil(float(rows.max())) + reach + 1
     image_range = min(max(first, 0), scan.lines - 1), max(min(last, scan.lines), 1)
-    return ColorLines(frame, lines[0], image_range, coarser, shift_mm, rows)
-
-
-def _smoothed_over(spacing: float) -> float:
-    return spacing if spacing >= _COARSE_FROM else 1.0
+    return ColorLines(frame, lines[0], image_range, sampling, shift_mm, rows)

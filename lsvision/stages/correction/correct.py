@@ -14,7 +14,7 @@ from torch import Tensor
 from lsvision.geometry import ProductFrame, depth_sigma, depth_step_mm, zero_disparity_mm
 from lsvision.image.resampling import SAMPLED_TILES
 from lsvision.image.tiling import TILE, in_parallel, tiles
-from lsvision.stages.correction.color_lines import ColorLines, color_lines
+from lsvision.stages.correction.color_lines import ColorLines, color_lines, sampling_for
 from lsvision.stages.correction.config import CorrectionConfig
 from lsvision.stages.correction.grid import plan_product
 from lsvision.stages.correction.locate import Locator, SeenCells
@@ -77,7 +77,8 @@ class Correction:
         if len(lines.along) < 2:
             return strip
         self.locator.profiles.load(lines.start, lines.stop)
-        colors = color_lines(self.scan, self.frame, (lines.start, lines.stop), self.locator.spacing)
+        sampling = sampling_for(self.config, self.locator.spacing)
+        colors = color_lines(self.scan, self.frame, (lines.start, lines.stop), sampling)
         image = self.scan.left.read(*colors.image_range)
 
         def fill_tile(tile: tuple[slice, slice]) -> None:
@@ -94,7 +95,7 @@ class Correction:
 
     def _sample_colors(self, colors: ColorLines, image: Tensor, seen: SeenCells, out: Tensor) -> None:
         for part in tiles(len(out), out.shape[1], SAMPLED_TILES[self.config.resampler]):
-            colors.sample(image, seen.part(*part), self.config, out[part])
+            colors.sample(image, seen.part(*part), out[part])
 
     def _fill_heights(self, seen: SeenCells, strip: ProductStrip, tile: tuple[slice, slice]) -> None:
         """Write everything but the colours of a tile to the strip."""

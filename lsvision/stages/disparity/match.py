@@ -41,11 +41,6 @@ def disparity_range(rig: Rig, config: DisparityConfig) -> tuple[int, int]:
     return math.floor(low), math.ceil(high)
 
 
-def match_strip(left: Tensor, right: Tensor, rig: Rig, config: DisparityConfig) -> Tensor:
-    """Disparity, px, of a pair of strips ``(lines, width, channels)``; NaN where there is no match."""
-    return measure_strip(left, right, rig, config).disparity
-
-
 def measure_strip(left: Tensor, right: Tensor, rig: Rig, config: DisparityConfig) -> StripMatch:
     """Disparity and sigma of a pair of strips ``(lines, width, channels)``.
 
