@@ -103,17 +103,18 @@ def _pool(threads: int, _process: int) -> ThreadPoolExecutor:
     return pool
 
 
-def keep_freed_memory() -> None:
-    """Keep the memory of finished tiles for the next ones; does nothing where the C library is not glibc.
+def keep_freed_memory() -> bool:
+    """Keep the memory of finished tiles for the next ones; returns whether the C library can, which glibc alone does.
 
     By default glibc returns it to the system after every tile and gets it back page by page, which takes as long as the
     work itself.
     """
     if sys.platform != "linux":
-        return
+        return False
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
     if mallopt is None:  # musl has none
-        return
+        return False
     mallopt(_M_MMAP_THRESHOLD, _KEPT_BYTES // 8)
     mallopt(_M_TRIM_THRESHOLD, _KEPT_BYTES)
     mallopt(_M_ARENA_MAX, 1)
+    return True

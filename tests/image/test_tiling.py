@@ -72,10 +72,10 @@ def test_other_systems_have_no_such_setting(system: str, monkeypatch: pytest.Mon
 
     monkeypatch.setattr(sys, "platform", system)
     monkeypatch.setattr(ctypes, "CDLL", no_library)
-    keep_freed_memory()
+    assert not keep_freed_memory()
 
 
 def test_other_c_libraries_have_no_such_setting(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "platform", "linux")
     monkeypatch.setattr(ctypes, "CDLL", lambda name: object())
-    keep_freed_memory()
+    assert not keep_freed_memory()

@@ -82,6 +82,7 @@ class Correction:
         image = self.scan.left.read(*colors.image_range)
 
         def fill_tile(tile: tuple[slice, slice]) -> None:
+            """Locate the cells of a tile and write what they see."""
             tile_rows, columns = tile
             seen = self.locator.locate(lines, (rows[0] + tile_rows.start, rows[0] + tile_rows.stop), columns)
             if seen is not None:

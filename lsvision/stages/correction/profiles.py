@@ -89,6 +89,7 @@ class ProfileReader:
         sigma = depth.sigma if self.with_sigma else None
 
         def resolve_block(index: int) -> Seen:
+            """Profiles of one block of lines."""
             lines = slice(index * _BLOCK_LINES - first, (index + 1) * _BLOCK_LINES - first)
             return resolve_profiles(
                 Depth(depth.z[lines], None if sigma is None else sigma[lines]), self.frame, self.rule
