@@ -12,8 +12,8 @@ class SceneConfig(Checked):
 
     A board or sheet is turned by ``R = Rz(yaw) Ry(roll) Rx(pitch)`` about its centre, which crosses the scan plane
     midway between the cameras, ``depth_offset_mm`` behind the plane of zero disparity, on the middle line. A rail runs
-    along the motion and can only roll about it; its crown lies ``rail_rise_mm`` above that depth. The conveyor is a
-    plane along the motion, ``conveyor_drop_mm`` behind the plane of zero disparity, and is hidden by any target.
+    along the motion and can only roll about it; its crown has the height ``rail_rise_mm`` in the product frame, counted
+    from that depth. The conveyor is a plane along the motion at the height ``-conveyor_drop_mm``; any target hides it.
     """
 
     kind: Literal["board", "sheet", "rail"] = "board"
