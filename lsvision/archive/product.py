@@ -9,12 +9,17 @@ from lsvision.errors import FileFormatError
 from lsvision.geometry import ProductFrame, zero_disparity_mm
 from lsvision.io import ProductLayout, check_product, read_product, read_scan
 from lsvision.io.atomic import check_replaceable
+from lsvision.io.inside import path_inside
 from lsvision.io.product.layout import ROOT_METADATA
 
 
 def product_path(output: Path, key: str) -> Path:
-    """Where the product of a scan lies."""
-    return output / f"{key}.zarr"
+    """Where the product of a scan lies.
+
+    Raises:
+        FileFormatError: not below the output.
+    """
+    return path_inside(output, f"{key}.zarr")
 
 
 def product_layout(planned: PlannedScan, processing: Processing, input_sha256: str, key: str) -> ProductLayout:
