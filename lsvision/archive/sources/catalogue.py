@@ -11,7 +11,7 @@ from pathlib import Path
 
 from lsvision.errors import ConfigError, FileFormatError
 from lsvision.io.formats.scan import FILE_KEYS, SCAN_FILE
-from lsvision.io.formats.validation import read_yaml, shown_path
+from lsvision.io.formats.validation import on_one_line, read_yaml
 from lsvision.io.inside import path_inside
 
 PATTERN_SIGNS = "*?["
@@ -68,7 +68,7 @@ def _places(archive: str, skip: Path | None) -> tuple[Path, Iterator[_Place]]:
     elif any(sign in archive for sign in PATTERN_SIGNS):
         places = [Path(match) for match in glob.glob(archive, recursive=True) if Path(match, SCAN_FILE).is_file()]
     else:
-        raise ConfigError(f"archive: no such folder, list or pattern: {shown_path(path)}")
+        raise ConfigError(f"archive: no such folder, list or pattern: {on_one_line(path)}")
     places = [_without_parents(place) for place in places]
     return _common_root(places), ((place, None) for place in places)
 
@@ -97,7 +97,7 @@ def _found(place: Path, root: Path, problem: str | None) -> Found:
     try:
         f"{key} {path}".encode()
     except UnicodeEncodeError:
-        return Found(shown_path(Path(key)), Path(shown_path(path)), problem or "its name is not UTF-8; rename it")
+        return Found(on_one_line(key), Path(on_one_line(path)), problem or "its name is not UTF-8; rename it")
     if any(part.casefold().endswith(".zarr") for part in Path(key).parts[:-1]):
         problem = problem or "lies in a folder whose name ends in .zarr, as those of products do"
     if Path(key).parts[:1] == (".work",):

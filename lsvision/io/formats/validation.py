@@ -98,7 +98,7 @@ def read_entries(schema: type[T], data: object, path: Path, where: str = "") -> 
     if not where and not isinstance(data, Mapping):  # not ours: nothing of it is shown
         kind = {str: "text", list: "a list", type(None): "null"}.get(type(data), "a number")
         raise FileFormatError(path, f"expected keys with values, got {kind}")
-    return build(schema, data, lambda key, problem: FileFormatError(path, problem, key or None), where)
+    return build(schema, data, lambda key, problem: FileFormatError(path, problem, on_one_line(key) or None), where)
 
 
 def named_file(path: Path, key: str, name: str) -> Path:
@@ -111,17 +111,17 @@ def named_file(path: Path, key: str, name: str) -> Path:
     try:
         mode = target.stat().st_mode
     except (OSError, ValueError):  # a null character, or a name that is too long
-        raise FileFormatError(path, f"no such file or folder: {shown_path(target)}", key) from None
+        raise FileFormatError(path, f"no such file or folder: {on_one_line(target)}", key) from None
     if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
         raise FileFormatError(path, f"expected a file or folder, got a device or pipe: {target}", key)
     return target
 
 
-def shown_path(path: Path) -> str:
-    """A path as an error shows it: on one line, cut where it is long."""
-    text = str(path).encode("utf-8", "backslashreplace").decode()
-    text = "".join(sign if sign.isprintable() else repr(sign)[1:-1] for sign in text)
-    return text if len(text) <= 300 else f"{text[:297]}..."
+def on_one_line(text: object) -> str:
+    """A name, key or path as an error shows it: on one line, cut where it is long."""
+    line = str(text).encode("utf-8", "backslashreplace").decode()
+    line = "".join(sign if sign.isprintable() else repr(sign)[1:-1] for sign in line[:400])
+    return line if len(line) <= 300 else f"{line[:297]}..."
 
 
 def _mapping(pairs: list[tuple[str, object]]) -> dict[str, object]:
