@@ -4,6 +4,7 @@
 """
 
 import logging
+import os
 import sys
 from functools import partial
 from pathlib import Path
@@ -17,6 +18,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from lsvision.errors import ConfigError, LsvisionError
 from lsvision.experiments import EXPERIMENTS
+from lsvision.experiments.command_line import EXPECTED, INTERRUPTED, in_one_line, print_any_letter, quoted
 from lsvision.experiments.hydra_hooks import register_settings
 
 log = logging.getLogger("lsvision")
@@ -51,8 +53,8 @@ def _run(config: DictConfig) -> None:
 
 
 @hydra.main(version_base="1.3", config_path=str(config_folder()), config_name="config")
-def main(config: DictConfig) -> None:
-    """Run the experiment that the configuration names; an expected failure is one line and its exit code.
+def _job(config: DictConfig) -> None:
+    """Run the experiment that the configuration names; the trace of a failure goes to the run's log.
 
     A job of a sweep records its failure instead, and the others go on.
     """
@@ -67,10 +69,35 @@ def main(config: DictConfig) -> None:
         return
     try:
         _run(config)
-    except LsvisionError as error:
+    except EXPECTED as error:
         _log_trace_to_file(error)
-        print(f"error: {error}", file=sys.stderr)
-        raise SystemExit(error.exit_code) from None
+        raise SystemExit(_report(error)) from None
+
+
+def main() -> None:
+    """Compose the configuration and run; an expected failure is one line and its exit code."""
+    print_any_letter()
+    known, sys.argv = sys.argv, [sys.argv[0]]
+    own_handling = os.environ.get("HYDRA_FULL_ERROR")
+    os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra's errors come here instead of being printed with its search paths
+    try:
+        sys.argv += quoted(known[1:])
+        _job()
+    except EXPECTED as error:
+        raise SystemExit(_report(error)) from None
+    except KeyboardInterrupt as stop:
+        done = str(stop) or "no file is half-written"
+        print(f"interrupted: {done}; run the same command again to go on", file=sys.stderr)
+        raise SystemExit(INTERRUPTED) from None
+    finally:
+        sys.argv = known
+        if own_handling is None:
+            del os.environ["HYDRA_FULL_ERROR"]
+
+
+def _report(error: BaseException) -> int:
+    print(f"error: {in_one_line(error)}", file=sys.stderr)
+    return error.exit_code if isinstance(error, LsvisionError) else 1
 
 
 def _log_trace_to_file(error: Exception) -> None:

@@ -6,7 +6,7 @@ from lsvision.archive.engines.local import LocalEngine
 from lsvision.archive.engines.protocol import Engine, EngineConfig, worker_count
 from lsvision.archive.job import WORK_FOLDER, Place
 from lsvision.archive.ledger import LEDGER_FILE, Ledger, ScanRow, StripRow, ledger_lines
-from lsvision.archive.lock import sole_run
+from lsvision.archive.lock import is_worked_on, sole_run
 from lsvision.archive.one_scan import FinishedProduct, plan_one, process_one
 from lsvision.archive.plan import Plan, plan_run, predicted_bytes, predicted_seconds
 from lsvision.archive.planned import PlannedScan, Processing
@@ -38,6 +38,7 @@ __all__ = [
     "calibration_for",
     "damaged_products",
     "find_scans",
+    "is_worked_on",
     "ledger_lines",
     "local_archive",
     "plan_one",

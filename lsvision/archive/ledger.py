@@ -8,16 +8,20 @@ from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any, Literal
 
-from lsvision.errors import FileFormatError, WriteError
+from lsvision.errors import FileFormatError, LsvisionError, WriteError
 from lsvision.io import MeasuredCells
 
 LEDGER_FILE = "ledger.sqlite"
 
 _VERSION = 2  # of the tables; version 1 recorded none
 _WAIT_SECONDS = 5.0
+_OF_THE_DISK = {
+    sqlite3.SQLITE_IOERR, sqlite3.SQLITE_CANTOPEN, sqlite3.SQLITE_READONLY, sqlite3.SQLITE_PERM, sqlite3.SQLITE_BUSY,
+    sqlite3.SQLITE_LOCKED, sqlite3.SQLITE_NOMEM,
+}  # fmt: skip
 
 Stage = Literal["disparity", "product"]
-Status = Literal["running", "done", "failed"]
+Status = Literal["running", "stopped", "done", "failed"]  # a scan as running while no run is at work was stopped
 
 _TABLES = (
     """
@@ -93,7 +97,7 @@ class Ledger:
 
     Raises:
         FileFormatError: the file is no ledger, or one of a later version.
-        WriteError: by every call that writes, when the disk is full.
+        WriteError: by every call, when the disk is full or fails.
     """
 
     def __init__(self, path: Path) -> None:
@@ -105,9 +109,7 @@ class Ledger:
             self._db.execute("PRAGMA synchronous=NORMAL")
             self._create_tables()
         except sqlite3.DatabaseError as error:
-            if _is_full(error):
-                raise self._full() from error
-            raise FileFormatError(path, f"not a ledger: {error}") from error
+            raise self._fault(error) from error
 
     def __enter__(self) -> "Ledger":
         return self
@@ -117,18 +119,18 @@ class Ledger:
 
     def scans(self) -> dict[str, ScanRow]:
         """All scans by their key, in order."""
-        rows = self._db.execute("SELECT * FROM scans ORDER BY scan")
+        rows = self._read("SELECT * FROM scans ORDER BY scan")
         return {row["scan"]: ScanRow(**dict(row)) for row in rows}
 
     def scan(self, key: str) -> ScanRow | None:
         """The row of one scan."""
-        row = self._db.execute("SELECT * FROM scans WHERE scan = ?", (key,)).fetchone()
-        return ScanRow(**dict(row)) if row is not None else None
+        rows = self._read("SELECT * FROM scans WHERE scan = ?", (key,))
+        return ScanRow(**dict(rows[0])) if rows else None
 
     def strips(self, scan: str | None = None) -> list[StripRow]:
         """The strips of a scan, or all, by scan, stage and number."""
         chosen, values = ("WHERE scan = ?", (scan,)) if scan is not None else ("", ())
-        rows = self._db.execute(f"SELECT * FROM strips {chosen} ORDER BY scan, stage, number", values)
+        rows = self._read(f"SELECT * FROM strips {chosen} ORDER BY scan, stage, number", values)
         return [StripRow(**dict(row)) for row in rows]
 
     def finished_strips(self, scan: str, stage: Stage, key: str) -> dict[int, StripRow]:
@@ -156,7 +158,7 @@ class Ledger:
 
     def seconds_per_line(self) -> Mapping[str, float]:
         """Mean time of a line in each stage, over all finished strips."""
-        rows = self._db.execute(
+        rows = self._read(
             "SELECT stage, SUM(seconds) / SUM(lines) FROM strips WHERE status = 'done' AND lines > 0 GROUP BY stage"
         )
         return {stage: float(seconds) for stage, seconds in rows}
@@ -186,13 +188,23 @@ class Ledger:
     def _write(self, statement: str, values: Mapping[str, Any] | tuple[Any, ...]) -> None:
         try:
             self._db.execute(statement, values)
-        except sqlite3.OperationalError as error:
-            if _is_full(error):
-                raise self._full() from error
-            raise
+        except sqlite3.DatabaseError as error:
+            raise self._fault(error) from error
 
-    def _full(self) -> WriteError:
-        return WriteError(f"{self._path}: cannot be written: the disk is full")
+    def _read(self, query: str, values: tuple[Any, ...] = ()) -> list[sqlite3.Row]:
+        try:
+            return self._db.execute(query, values).fetchall()
+        except sqlite3.DatabaseError as error:
+            raise self._fault(error) from error
+
+    def _fault(self, error: sqlite3.DatabaseError) -> LsvisionError:
+        """SQLite's error as ours: the disk's, or the file's."""
+        code = getattr(error, "sqlite_errorcode", None)
+        if code == sqlite3.SQLITE_FULL:
+            return WriteError(f"{self._path}: cannot be written: the disk is full")
+        if code is not None and code & 0xFF in _OF_THE_DISK:  # the lower byte is the kind, the upper its details
+            return WriteError(f"{self._path}: cannot be read or written: {error}")
+        return FileFormatError(self._path, f"not a ledger: {error}")
 
 
 def measured_cells(strips: Iterable[StripRow]) -> MeasuredCells:
@@ -217,10 +229,6 @@ def _upsert(table: str, schema: type) -> str:
     changes = ", ".join(f"{name} = excluded.{name}" for name in names)
     values = ", ".join(f":{name}" for name in names)
     return f"INSERT INTO {table} ({', '.join(names)}) VALUES ({values}) ON CONFLICT DO UPDATE SET {changes}"
-
-
-def _is_full(error: sqlite3.DatabaseError) -> bool:
-    return getattr(error, "sqlite_errorcode", None) == sqlite3.SQLITE_FULL
 
 
 def _log_ahead(db: sqlite3.Connection) -> None:

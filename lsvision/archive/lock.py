@@ -15,6 +15,19 @@ with warnings.catch_warnings():
 LOCK_FILE = ".lock"
 
 
+def is_worked_on(output: Path) -> bool:
+    """Whether a run holds an output; one whose lock cannot be asked for counts as held."""
+    if not (output / LOCK_FILE).is_file():
+        return False
+    lock = FileLock(output / LOCK_FILE)
+    try:
+        lock.acquire(blocking=False)
+    except (Timeout, OSError):
+        return True
+    lock.release()
+    return False
+
+
 @contextmanager
 def sole_run(output: Path, lock_file: Path | None = None) -> Iterator[None]:
     """Hold an output, or the part of it that a lock file stands for, while the block runs.

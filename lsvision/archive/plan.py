@@ -40,6 +40,7 @@ def plan_run(
     plan = Plan([], [], {})
     for item in found:
         try:
+            product_path(output, item.key)
             scan = plan_scan(item, calibrations, processing)
         except LsvisionError as error:
             plan.faulty[item] = str(error)

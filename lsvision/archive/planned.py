@@ -76,8 +76,8 @@ def plan_scan(found: Found, calibrations: Sequence[DatedCalibration], processing
     """
     if found.problem is not None:
         raise FileFormatError(found.path, found.problem)
-    stamp = stamp_of(found.path)
     scan = read_scan(found.path, repair_encoder=processing.repair_encoder)
+    stamp = stamp_of(found.path)  # of files that are known to be images: a folder of any other kind may have no end
     calibration = calibration_for(scan, calibrations)
     grid = plan_product(scan, calibration.calibration.motion, processing.correction)
     return PlannedScan(

@@ -1,5 +1,6 @@
 """The product of a scan of an archive: where it lies, how it is laid out, and whether it is whole."""
 
+import os
 from dataclasses import asdict
 from pathlib import Path
 
@@ -9,12 +10,22 @@ from lsvision.errors import FileFormatError
 from lsvision.geometry import ProductFrame, zero_disparity_mm
 from lsvision.io import ProductLayout, check_product, read_product, read_scan
 from lsvision.io.atomic import check_replaceable
+from lsvision.io.inside import path_inside
 from lsvision.io.product.layout import ROOT_METADATA
+
+_LONGEST_NAME = 200  # a product that is written has 48 characters more, and disks take 255
 
 
 def product_path(output: Path, key: str) -> Path:
-    """Where the product of a scan lies."""
-    return output / f"{key}.zarr"
+    """Where the product of a scan lies.
+
+    Raises:
+        FileFormatError: not below the output, or with a name that is too long for one.
+    """
+    length = max(len(os.fsencode(part)) for part in ("", *Path(key).parts))
+    if length > _LONGEST_NAME:
+        raise FileFormatError(output / f"{key}.zarr", f"expected names of at most {_LONGEST_NAME} bytes, got {length}")
+    return path_inside(output, f"{key}.zarr")
 
 
 def product_layout(planned: PlannedScan, processing: Processing, input_sha256: str, key: str) -> ProductLayout:

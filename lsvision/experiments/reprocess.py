@@ -3,7 +3,7 @@
 import logging
 import time
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 from lsvision.archive import (
@@ -22,6 +22,7 @@ from lsvision.archive import (
     Task,
     damaged_products,
     find_scans,
+    is_worked_on,
     ledger_lines,
     local_archive,
     plan_run,
@@ -83,7 +84,10 @@ def run_reprocess(settings: ReprocessSettings, folder: Path) -> None:
         _log_plan(plan, ledger.seconds_per_line(), settings.engine)
         begin = time.perf_counter()
         place = Place(ledger, output, output / WORK_FOLDER, _processing(settings), verify=settings.verify)
-        processed = _process(settings, plan, place)
+        try:
+            processed = _process(settings, plan, place)
+        except KeyboardInterrupt:
+            raise KeyboardInterrupt(_done_so_far(plan, ledger)) from None
         for found, problem in plan.faulty.items():
             ledger.put_scan(ScanRow(found.key, str(found.path), "failed", error=problem))
         seconds = time.perf_counter() - begin
@@ -101,11 +105,25 @@ def run_reprocess(settings: ReprocessSettings, folder: Path) -> None:
 
 def run_status(settings: StatusSettings, folder: Path) -> None:
     """Print the ledger of an output."""
-    rows, _ = _read_ledger(Path(settings.output))
+    output = Path(settings.output)
+    rows, _ = _read_ledger(output)
     if not rows:
         raise ConfigError(f"output: no ledger in {settings.output}")
+    if not is_worked_on(output):
+        rows = {key: _at_rest(row) for key, row in rows.items()}
     for line in ledger_lines(rows):
         log.info("%s", line)
+
+
+def _at_rest(row: ScanRow) -> ScanRow:
+    """A scan's row where no run is at work: one that was ended left its scans as running."""
+    return replace(row, status="stopped") if row.status == "running" else row
+
+
+def _done_so_far(plan: Plan, ledger: Ledger) -> str:
+    rows = ledger.scans()
+    done = sum(scan.key in rows and rows[scan.key].status == "done" for scan in plan.to_do)
+    return f"{done} of {len(plan.to_do)} scans are done, and finished strips of others are kept"
 
 
 def _plan(settings: ReprocessSettings, output: Path, known: Mapping[str, ScanRow]) -> Plan:

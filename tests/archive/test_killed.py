@@ -7,7 +7,6 @@ import random
 import re
 import signal
 import socket
-import sqlite3
 import subprocess
 import sys
 import time
@@ -17,6 +16,7 @@ from pathlib import Path
 import pytest
 
 from lsvision.archive import LEDGER_FILE, Ledger
+from lsvision.errors import LsvisionError
 from tests.archive.archives import assert_same_products, make_calibration, make_scan
 
 pytestmark = pytest.mark.slow
@@ -68,7 +68,7 @@ def done_strips(output: Path) -> dict[tuple[str, str, int], tuple[float, int]]:
     try:
         with Ledger(output / LEDGER_FILE) as ledger:
             strips = ledger.strips()
-    except sqlite3.OperationalError:  # being made
+    except LsvisionError:  # being made
         return {}
     return {(s.scan, s.stage, s.number): (s.seconds, s.runs) for s in strips if s.status == "done"}
 

@@ -10,7 +10,7 @@ import pytest
 from lsvision.archive import Ledger, ScanRow, StripRow, find_scans, ledger_lines, read_calibrations
 from lsvision.archive.plan import plan_run, predicted_bytes, predicted_seconds
 from lsvision.archive.planned import IDLE_BYTES, rows_for_memory
-from lsvision.errors import FileFormatError
+from lsvision.errors import FileFormatError, WriteError
 from tests.archive.archives import PROCESSING
 
 
@@ -116,3 +116,24 @@ def test_what_is_no_ledger(tmp_path):
     (tmp_path / "ledger.sqlite").write_text("something else, long enough to be read as the head of a database")
     with pytest.raises(FileFormatError, match="not a ledger"):
         Ledger(tmp_path / "ledger.sqlite")
+
+
+def test_a_full_disk_and_a_damaged_ledger_are_one_line(tmp_path):
+    path = tmp_path / "ledger.sqlite"
+    with Ledger(path) as ledger:
+        for number in range(200):
+            ledger.put_scan(ScanRow(f"s{number}", "/s", "done", error="x" * 500))
+        ledger._db.execute("PRAGMA max_page_count = 1")  # no smaller than it is now: it cannot grow
+        with pytest.raises(WriteError, match=r"ledger\.sqlite: cannot be written: the disk is full"):
+            ledger.put_scan(ScanRow("large", "/s", "done", error="x" * 100_000))
+        ledger._db.execute("PRAGMA query_only = ON")
+        with pytest.raises(WriteError, match=r"ledger\.sqlite: cannot be read or written"):
+            ledger.put_scan(ScanRow("other", "/s", "done"))
+    content = path.read_bytes()
+    path.write_bytes(content[:8192] + b"\xff" * (len(content) - 8192))
+    with pytest.raises(FileFormatError, match=r"ledger\.sqlite: not a ledger"), Ledger(path) as ledger:
+        ledger.scans()
+    path.unlink()
+    path.mkdir()
+    with pytest.raises(WriteError, match=r"ledger\.sqlite: cannot be read or written: unable to open"):
+        Ledger(path)

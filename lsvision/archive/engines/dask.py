@@ -59,7 +59,9 @@ class DaskEngine:
                 n_workers=workers,
                 threads_per_worker=1,
                 memory_limit=worker_memory_mb * 2**20 * 2,
-                dashboard_address=":0",
+                # Whoever reaches the scheduler or a worker can run any program: nobody from another machine can.
+                host="127.0.0.1",
+                dashboard_address="127.0.0.1:0",
                 silence_logs=50,
             )
         try:

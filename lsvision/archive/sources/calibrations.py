@@ -7,6 +7,8 @@ from datetime import date
 from pathlib import Path
 from typing import Annotated
 
+from pydantic import BeforeValidator
+
 from lsvision.errors import CalibrationError, FileFormatError
 from lsvision.io import check_rig_match, read_calibration
 from lsvision.io.formats.validation import named_file, read_entries, read_yaml
@@ -15,7 +17,12 @@ from lsvision.types import Calibration, Scan
 
 LIST_FILE = "calibrations.yaml"
 
-Day = Annotated[date, Says("a day as 2024-05-31")]
+
+def _as_day(value: object) -> object:
+    return date.fromisoformat(value) if isinstance(value, str) else value
+
+
+Day = Annotated[date, BeforeValidator(_as_day), Says("a day as 2024-05-31")]
 
 
 @dataclass(frozen=True)
@@ -25,6 +32,11 @@ class ListedCalibration(Checked):
     file: Text
     first: Day | None = field(default=None, metadata={"key": "from"})
     last: Day | None = field(default=None, metadata={"key": "to"})
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.first is not None and self.last is not None and self.last < self.first:
+            raise self.fault("to", f"expected a day from {self.first} on, got {self.last}")
 
 
 @dataclass(frozen=True)

@@ -3,14 +3,21 @@
 import errno
 import glob
 import os
-from collections.abc import Iterator
-from dataclasses import dataclass
+import unicodedata
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 
-from lsvision.errors import ConfigError
-from lsvision.io.formats.scan import SCAN_FILE
+from lsvision.errors import ConfigError, FileFormatError
+from lsvision.io.formats.scan import FILE_KEYS, SCAN_FILE
+from lsvision.io.formats.validation import on_one_line, read_yaml
+from lsvision.io.inside import path_inside
 
 PATTERN_SIGNS = "*?["
+COPIES_FILE = ".copied.json"  # in a folder of copies, what they are copies of
+
+_Place = tuple[Path, str | None]
 
 
 @dataclass(frozen=True)
@@ -35,20 +42,9 @@ def find_scans(archive: str, skip: Path | None = None) -> list[Found]:
         skip: a folder to leave out, where products are written.
 
     Raises:
-        ConfigError: there is no such folder or file.
+        ConfigError: there is no such folder or file, or it is no list.
     """
-    path = Path(archive)
-    if path.is_dir():
-        places = _walk(path, skip.resolve() if skip else None)
-        root = path
-    elif path.is_file():
-        listed = [path.parent / line.strip() for line in path.read_text(encoding="utf-8").splitlines() if line.strip()]
-        places, root = ((place, None) for place in listed), _common_root(listed)
-    elif any(sign in archive for sign in PATTERN_SIGNS):
-        matched = [Path(match) for match in glob.glob(archive, recursive=True) if Path(match, SCAN_FILE).is_file()]
-        places, root = ((place, None) for place in matched), _common_root(matched)
-    else:
-        raise ConfigError(f"archive: no such folder, list or pattern: {archive}")
+    root, places = _places(archive, skip)
     seen: set[Path] = set()
     found = []
     # A folder that several links lead to goes by its own name, where that is in the archive too.
@@ -58,11 +54,88 @@ def find_scans(archive: str, skip: Path | None = None) -> list[Found]:
         real = place if problem else Path(os.path.realpath(place))
         if real not in seen:
             seen.add(real)
-            found.append(Found(_key(place, root), place.absolute(), problem))
-    return sorted(found, key=lambda item: item.key)
+            found.append(_found(place, root, problem))
+    return sorted(_with_own_names(found), key=lambda item: item.key)
 
 
-def _walk(root: Path, skip: Path | None) -> Iterator[tuple[Path, str | None]]:
+def _places(archive: str, skip: Path | None) -> tuple[Path, Iterator[_Place]]:
+    """The root of an archive, and the places of its scans."""
+    path = Path(archive)
+    if os.path.isdir(path):
+        return path, _walk(path, skip.resolve() if skip else None)
+    if os.path.isfile(path):
+        places = _read_list(path)
+    elif any(sign in archive for sign in PATTERN_SIGNS):
+        places = [Path(match) for match in glob.glob(archive, recursive=True) if Path(match, SCAN_FILE).is_file()]
+    else:
+        raise ConfigError(f"archive: no such folder, list or pattern: {on_one_line(path)}")
+    places = [_without_parents(place) for place in places]
+    return _common_root(places), ((place, None) for place in places)
+
+
+def _read_list(path: Path) -> list[Path]:
+    try:
+        text = path.read_text(encoding="utf-8-sig")  # editors on Windows put a mark before it
+    except UnicodeDecodeError as error:
+        raise ConfigError(f"archive: {path}: expected a list as UTF-8 text, got byte {error.start}") from None
+    except OSError as error:
+        raise ConfigError(f"archive: {path}: {_in_words(error)}") from None
+    lines = [line.strip() for line in text.splitlines()]
+    if any("\0" in line for line in lines):
+        raise ConfigError(f"archive: {path}: expected a list of folders, got null characters")
+    return [path.parent / line for line in lines if line]
+
+
+def _without_parents(place: Path) -> Path:
+    """A place named without ``..``, so that its product lies where its name says."""
+    return Path(os.path.realpath(place)) if ".." in place.parts else place
+
+
+def _found(place: Path, root: Path, problem: str | None) -> Found:
+    """A place with its key, and what is wrong with its name."""
+    key, path = _key(place, root), place.absolute()
+    try:
+        f"{key} {path}".encode()
+    except UnicodeEncodeError:
+        return Found(on_one_line(key), Path(on_one_line(path)), problem or "its name is not UTF-8; rename it")
+    if any(part.casefold().endswith(".zarr") for part in Path(key).parts[:-1]):
+        problem = problem or "lies in a folder whose name ends in .zarr, as those of products do"
+    if Path(key).parts[:1] == (".work",):
+        problem = problem or "lies in a folder .work, where unfinished products are kept"
+    return Found(key, path, problem or _problem_of_copy(place, root))
+
+
+def _problem_of_copy(place: Path, root: Path) -> str | None:
+    """Whether a scan of a copied archive names files that are none of the archive's."""
+    if not (root / COPIES_FILE).is_file():
+        return None
+    try:
+        entries = read_yaml(place / SCAN_FILE)
+    except FileFormatError:
+        return None  # reported where the scan is read
+    named = entries if isinstance(entries, Mapping) else {}
+    for key in FILE_KEYS:
+        try:
+            path_inside(root, place / str(named.get(key, "")))
+        except FileFormatError:
+            return f"{SCAN_FILE}: {key}: leads outside the archive"
+    return None
+
+
+def _with_own_names(found: list[Found]) -> Iterator[Found]:
+    """Scans whose products would take each other's place on some file system are at fault, each of them."""
+    count = Counter(_folded(item.key) for item in found)
+    for item in found:
+        same = count[_folded(item.key)] > 1
+        problem = "another scan's name differs in nothing but case or Unicode form; rename one"
+        yield replace(item, problem=item.problem or problem) if same else item
+
+
+def _folded(key: str) -> str:
+    return unicodedata.normalize("NFC", unicodedata.normalize("NFC", key).casefold())
+
+
+def _walk(root: Path, skip: Path | None) -> Iterator[_Place]:
     """Scan folders below a folder, and places that cannot be read; links are followed, but never round in circles."""
     pending: list[tuple[Path, tuple[Path, ...]]] = [(root, (root.resolve(),))]
     while pending:

@@ -2,19 +2,21 @@
 
 import json
 import posixpath
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile
 
 import fsspec
-import yaml
 from fsspec.implementations.local import LocalFileSystem
 
-from lsvision.archive.sources.catalogue import PATTERN_SIGNS, SCAN_FILE
-from lsvision.errors import ConfigError
+from lsvision.archive.sources.catalogue import COPIES_FILE, PATTERN_SIGNS, SCAN_FILE
+from lsvision.errors import ConfigError, FileFormatError
 from lsvision.io import write_json
+from lsvision.io.formats.validation import YAML_BYTES, parse_yaml
+from lsvision.io.inside import path_inside
 
-_MANIFEST = ".copied.json"
 # What changes with a file, cheap to ask for; every file system knows some of them.
 _STAMPS = ("size", "ETag", "etag", "mtime", "LastModified", "last_modified", "modified", "created")
 
@@ -29,7 +31,8 @@ def local_archive(archive: str, copies: Path) -> str:
             archive no longer has is removed.
 
     Raises:
-        ConfigError: an unknown protocol, no scans there, or the file system cannot be read.
+        ConfigError: an unknown protocol, no scans there, a file whose name leads out of the archive, or the file system
+            cannot be read.
     """
     if "://" not in archive:
         return archive
@@ -38,8 +41,11 @@ def local_archive(archive: str, copies: Path) -> str:
         if isinstance(files, LocalFileSystem):
             return str(place)
         _copy(files, str(place).rstrip("/"), copies)
-    except (ImportError, ValueError, OSError) as error:
-        raise ConfigError(f"archive: {archive} cannot be read: {error}") from error
+    except FileFormatError as error:
+        raise ConfigError(f"archive: {archive}: {error}") from error
+    # A damaged archive surfaces as the error of any library behind it.
+    except (ImportError, ValueError, OSError, RuntimeError, EOFError, NotImplementedError, BadZipFile) as error:
+        raise ConfigError(f"archive: {archive} cannot be read: {' '.join(str(error).split())}") from error
     return str(copies)
 
 
@@ -48,39 +54,84 @@ def _copy(files: fsspec.AbstractFileSystem, place: str, copies: Path) -> None:
     scans = sorted({str(found) for name in names for found in files.glob(f"{name}/{SCAN_FILE}")})
     if not scans:
         raise ConfigError(f"archive: no scans at {place}")
-    root = posixpath.commonpath([posixpath.dirname(posixpath.dirname(scan)) for scan in scans])
-    manifest = copies / _MANIFEST
-    before = json.loads(manifest.read_text(encoding="utf-8")) if manifest.is_file() else {}
-    now = {posixpath.relpath(path, root): (path, stamp) for path, stamp in _stamps(files, scans)}
+    stamps, root = _stamps(files, scans, _fixed_part(place))
+    now = {posixpath.relpath(_rooted(path), root): (path, stamp) for path, stamp in stamps.items()}
+    targets = {name: path_inside(copies, name) for name in now}
+    before = _copied_before(copies)
     for name in before.keys() - now.keys():
-        (copies / name).unlink(missing_ok=True)
+        path_inside(copies, name).unlink(missing_ok=True)
     kept = {}
     for name, (path, stamp) in now.items():
-        target = copies / name
+        target = targets[name]
         if before.get(name) != stamp or not target.is_file():
             target.parent.mkdir(parents=True, exist_ok=True)
             files.get_file(path, str(target))
         kept[name] = stamp
     if kept != before:
-        write_json(manifest, kept)
+        write_json(copies / COPIES_FILE, kept)
 
 
-def _stamps(files: fsspec.AbstractFileSystem, scans: list[str]) -> Iterator[tuple[str, str]]:
-    """Every file of some scans, the rigs beside them too, and a text that changes with it."""
-    for scan in scans:
-        folder = posixpath.dirname(scan)
-        found: dict[str, dict[str, Any]] = files.find(folder, detail=True)
-        rig = _rig_beside(files, scan)
-        if rig is not None and rig not in found and files.exists(rig):
-            found[rig] = files.info(rig)
-        for path, details in found.items():
-            yield str(path), repr([str(details[key]) for key in _STAMPS if key in details])
-
-
-def _rig_beside(files: fsspec.AbstractFileSystem, scan: str) -> str | None:
+def _copied_before(copies: Path) -> dict[str, str]:
+    """The copies that are there, with what changes with their originals; none where that is not recorded."""
     try:
-        values = yaml.safe_load(files.cat_file(scan))
-    except yaml.YAMLError:
-        return None  # reported where the scan is read
-    rig = values.get("rig") if isinstance(values, dict) else None
-    return posixpath.normpath(posixpath.join(posixpath.dirname(scan), rig)) if isinstance(rig, str) else None
+        before = json.loads((copies / COPIES_FILE).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return before if isinstance(before, dict) else {}
+
+
+def _fixed_part(place: str) -> str:
+    """The folder that a pattern does not leave."""
+    fixed = re.split(f"[{re.escape(PATTERN_SIGNS)}]", place, maxsplit=1)[0]
+    return place if fixed == place else posixpath.dirname(fixed)
+
+
+def _stamps(files: fsspec.AbstractFileSystem, scans: list[str], place: str) -> tuple[dict[str, str], str]:
+    """Every file of some scans with a text that changes with it, and the folder that holds all: the archive's root.
+
+    The rigs beside or above the scans are among them, where they lie in the archive too.
+    """
+    parents = [posixpath.dirname(posixpath.dirname(scan)) for scan in scans]
+    limit = _common([place, *parents])
+    found: dict[str, dict[str, Any]] = {}
+    for scan in scans:
+        found |= files.find(posixpath.dirname(scan), detail=True)
+    for rig in _rigs(files, scans):
+        if rig not in found and not rig.startswith("..") and _common([limit, rig]) == limit and files.exists(rig):
+            found[rig] = files.info(rig)
+            parents.append(posixpath.dirname(rig))
+    return {str(path): _stamp(details) for path, details in found.items()}, _common(parents)
+
+
+def _common(paths: list[str]) -> str:
+    """The folder that holds all of some paths; some file systems begin theirs with a slash, some do not."""
+    return posixpath.commonpath([posixpath.normpath(_rooted(path)) for path in paths])
+
+
+def _rooted(path: str) -> str:
+    """A path from the file system's root.
+
+    Raises:
+        FileFormatError: it goes up, as names in a ZIP can.
+    """
+    if ".." in path.split("/"):
+        raise FileFormatError(path, "leads outside the archive")
+    return f"/{path.lstrip('/')}"
+
+
+def _stamp(details: dict[str, Any]) -> str:
+    return repr([str(details[key]) for key in _STAMPS if key in details])
+
+
+def _rigs(files: fsspec.AbstractFileSystem, scans: list[str]) -> Iterator[str]:
+    """The paths of the rigs that scans name."""
+    for scan in scans:
+        if (files.info(scan).get("size") or 0) > YAML_BYTES:
+            continue
+        try:
+            values = parse_yaml(files.cat_file(scan).decode("utf-8"), scan)
+        except (UnicodeDecodeError, FileFormatError):
+            continue  # reported where the scan is read
+        rig = values.get("rig") if isinstance(values, dict) else None
+        if isinstance(rig, str):
+            yield posixpath.normpath(posixpath.join(posixpath.dirname(scan), rig))

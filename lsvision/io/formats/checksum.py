@@ -3,6 +3,7 @@
 import hashlib
 from pathlib import Path
 
+from lsvision.errors import FileFormatError
 from lsvision.io.formats.scan import scan_files
 
 _BLOCK = 1 << 20
@@ -13,9 +14,14 @@ def scan_sha256(path: Path | str) -> str:
 
     Args:
         path: the folder of a scan that ``read_scan`` accepts.
+
+    Raises:
+        FileFormatError: a file that it names is missing, a device or a pipe.
     """
     digest = hashlib.sha256()
     for file in scan_files(path):
+        if not file.is_file():
+            raise FileFormatError(file, "no such file")
         with file.open("rb") as stream:
             while block := stream.read(_BLOCK):
                 digest.update(block)

@@ -7,7 +7,7 @@ from typing import Any
 import torch
 import zarr
 
-from lsvision.errors import FileFormatError
+from lsvision.errors import FileFormatError, LsvisionError
 from lsvision.io.product.layout import image_names
 from lsvision.io.product.measured import MeasuredCells
 from lsvision.io.product.pyramid import level_shape, multiscales
@@ -34,6 +34,16 @@ def check_product(path: Path | str) -> ProductCheck:
             damaged, or images that contradict each other; names the image and the rows.
     """
     product = read_product(path)
+    try:
+        return _check(product)
+    except LsvisionError:
+        raise
+    except Exception as error:  # damaged metadata surfaces as any of a dozen types
+        problem = " ".join(f"{type(error).__name__}: {error}".split())
+        raise FileFormatError(product.path, f"damaged: {problem}") from error
+
+
+def _check(product: Product) -> ProductCheck:
     root = zarr.open_group(product.path, mode="r")
     for name in image_names(root):
         levels = _check_metadata(product, name, root[name])

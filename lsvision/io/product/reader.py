@@ -1,5 +1,6 @@
 """The product of a corrected scan, opened for reading."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -120,10 +121,12 @@ def read_product(path: Path | str) -> Product:
         root = zarr.open_group(path, mode="r")
         ome = root["height"].attrs["ome"]
         scale, translation = ome["multiscales"][0]["datasets"][0]["coordinateTransformations"]
+        origin_y, origin_x = map(float, translation["translation"])
+        pitch = float(scale["scale"][-1])
+        metadata = dict(root.attrs.get("lsvision", {}))
         shapes = {name: root[f"{name}/{FULL_LEVEL}"].shape[-2:] for name in image_names(root)}
     except Exception as error:  # damaged metadata surfaces as any of a dozen types
-        raise FileFormatError(path, f"not a readable product: {error}") from error
-    metadata = dict(root.attrs.get("lsvision", {}))
+        raise FileFormatError(path, f"not a readable product: {' '.join(str(error).split())}") from error
     if metadata.get("format") != PRODUCT_FORMAT:
         problem = f"expected {PRODUCT_FORMAT!r}, got {shown(metadata.get('format'))}"
         raise FileFormatError(path, problem, "lsvision.format")
@@ -131,5 +134,7 @@ def read_product(path: Path | str) -> Product:
     for name, shape in shapes.items():
         if shape != (rows, columns):
             raise FileFormatError(path, f"expected {rows} x {columns} cells as height has", name)
-    origin_y, origin_x = map(float, translation["translation"])
-    return Product(path, ProductGrid(rows, columns, float(scale["scale"][-1]), origin_y, origin_x), metadata)
+    if not (0 < pitch < math.inf and math.isfinite(origin_y) and math.isfinite(origin_x)):
+        problem = f"expected a finite pitch > 0 and origin, got {pitch} and {origin_y}, {origin_x}"
+        raise FileFormatError(path, problem, "height.ome")
+    return Product(path, ProductGrid(rows, columns, pitch, origin_y, origin_x), metadata)

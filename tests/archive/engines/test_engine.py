@@ -6,6 +6,7 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
+import psutil
 import pytest
 
 from lsvision.archive import EngineConfig, LocalEngine, worker_count
@@ -109,6 +110,21 @@ def test_dask_lets_no_task_wait_where_another_could_end_the_worker():
             most = max([most, *map(len, engine._client.processing().values())])
         assert most == 1
         assert len([*engine.collect(), *engine.collect()]) == 2
+
+
+def test_a_local_cluster_listens_to_this_machine_alone():
+    pytest.importorskip("distributed")
+    from lsvision.archive.engines.dask import DaskEngine
+
+    own = psutil.Process()
+    before = {found.laddr for found in own.net_connections("tcp")}
+    with DaskEngine(None, 1, 3072) as engine:
+        assert engine._client.wait_for_workers(1) is None
+        found = [found for process in (own, *own.children(recursive=True)) for found in process.net_connections("tcp")]
+        listening = {item.laddr for item in found if item.status == psutil.CONN_LISTEN} - before
+        assert engine.dashboard.startswith("http://127.0.0.1:")
+    assert len(listening) >= 3  # the scheduler, its dashboard, a worker
+    assert {address.ip for address in listening} == {"127.0.0.1"}
 
 
 @pytest.mark.slow

@@ -82,6 +82,12 @@ def test_more_than_one_fits(dated):
         ("{}", "expected a list of calibrations"),
         ("- {file: winter.json}", r"\[0\].file: no such file"),
         ("- {file: spring.json, from: soon}", r"\[0\].from: expected a day as 2024-05-31, got 'soon'"),
+        ("- {file: spring.json, from: 2024-02-30}", r"\[0\].from: expected a day as 2024-05-31, got '2024-02-30'"),
+        ("- {file: spring.json, to: 5}", r"\[0\].to: expected a day as 2024-05-31, got 5"),
+        ("- {file: spring.json, from: 2024-06-01, to: 2024-05-31}", r"\[0\].to: expected a day from 2024-06-01 on"),
+        ("- {file: /dev/zero}", r"\[0\].file: expected a file or folder, got a device"),
+        ("- {file: .}", "expected a file, got a folder"),
+        ("- 5", r"\[0\]: expected keys with values"),
         ("- {file: spring.json, until: 2024-06-01}", r"\[0\].until: unknown key"),
     ],
 )

@@ -1,0 +1,163 @@
+"""What a person types wrongly, or in another language: one line, and an exit code that says which."""
+
+import io
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from lsvision.archive import LEDGER_FILE, Ledger, ScanRow, sole_run
+from lsvision.errors import ConfigError
+from lsvision.experiments.command_line import print_any_letter, quoted
+from lsvision.experiments.reprocess import StatusSettings, run_status
+from tests.archive.archives import make_calibration, make_scan
+
+REPROCESS = ("+experiment=reprocess", "calibration=c.json")
+
+
+@pytest.mark.parametrize(
+    ("overrides", "problem"),
+    [
+        (["+experiment=corect"], "experiment: there is no 'corect'; choose one of calibrate, "),
+        (["+experiment=calibrate", "scans=DIR"], "scans: expected a list, got 'DIR'"),
+        (["+experiment=calibrate", "scans=[a"], "scans=[a: cannot be understood; put quotes"),
+        (["+experiment=correct", "scan=a(b", "calibration=c.json"], "scan=a(b: cannot be understood"),
+        (["+experiment=calibrate", "calibration.metod=joint"], "Could not override 'calibration.metod'."),
+        (["+experiment=calibrate", "scans=[Schiene Ä,ü]"], "Schiene Ä/scan.yaml: no such file"),
+        (["+experiment=correct", "scan=Käfer", "calibration=ö.json"], "Käfer/scan.yaml: no such file"),
+        (["+experiment=validate", "product=" + "x" * 300], "x: not a readable product: "),
+        (["+experiment=status", "output=\udcff"], r"output=\udcff: not UTF-8"),
+        ([*REPROCESS, "archive=.", "output=afile"], "afile: File exists"),
+        ([*REPROCESS, "archive=.", "output=afile/o"], "afile/o: Not a directory"),
+        ([*REPROCESS, "archive=" + "x" * 300, "output=o"], "archive: no such folder, list or pattern: "),
+        ([*REPROCESS, "archive=latin1.txt", "output=o"], "archive: latin1.txt: expected a list as UTF-8 text"),
+        ([*REPROCESS, "archive=.", "output=" + "x" * 300], "x: File name too long"),
+    ],
+)
+def test_one_line(command, tmp_path, capsys, overrides, problem):
+    make_calibration(tmp_path / "c.json")
+    (tmp_path / "afile").write_text("")
+    (tmp_path / "latin1.txt").write_bytes("Wärme".encode("latin-1"))
+    assert command(*overrides) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("error: ")
+    assert problem in line
+
+
+def test_a_name_that_leaves_no_room_for_its_product(command, tmp_path, capsys):
+    make_calibration(tmp_path / "c.json")
+    make_scan(tmp_path / "archive" / ("ä" * 105), 40)
+    assert command(*REPROCESS, "archive=archive", "output=o") == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "1 of 1 scans failed" in line
+    with Ledger(tmp_path / "o" / LEDGER_FILE) as ledger:
+        assert [row.error[-50:] for row in ledger.scans().values()] == [
+            ".zarr: expected names of at most 200 bytes, got 210"[-50:]
+        ]
+
+
+def test_a_folder_that_cannot_be_made_for_the_run(tmp_path, monkeypatch, capsys):
+    from lsvision import run
+
+    (tmp_path / "afile").write_text("")
+    monkeypatch.setattr(
+        sys, "argv", ["lsvision", "+experiment=status", "output=o", f"hydra.run.dir={tmp_path}/afile/x"]
+    )
+    with pytest.raises(SystemExit) as stop:
+        run.main()
+    assert stop.value.code == 1
+    assert capsys.readouterr().err == f"error: {tmp_path}/afile/x: Not a directory\n"
+    assert "HYDRA_FULL_ERROR" not in os.environ
+
+
+def test_letters_beyond_ascii_are_quoted():
+    given = [
+        "--multirun",
+        "+experiment=x",
+        "a.b=ä",
+        "c=[a, ü b,'ö']",
+        "c=[a,ü b]",
+        'd="ä"',
+        "e=ä,b",
+        "f=choice(ä)",
+        "g=a",
+    ]
+    assert quoted(given) == [
+        "--multirun", "+experiment=x", "a.b='ä'", "c=[a, ü b,'ö']", "c=[a,'ü b']", 'd="ä"', "e='ä',b", "f=choice(ä)",
+        "g=a",
+    ]  # fmt: skip
+    with pytest.raises(ConfigError, match="not UTF-8"):
+        quoted(["a=\udcff"])
+
+
+def test_a_console_of_few_letters(monkeypatch):
+    for name in ("stdout", "stderr"):
+        monkeypatch.setattr(sys, name, io.TextIOWrapper(io.BytesIO(), encoding="cp1252"))
+    print_any_letter()
+    print("Köpfe 東", flush=True)
+    assert sys.stdout.buffer.getvalue() == "Köpfe \\u6771\n".encode("cp1252")
+
+
+def status_lines(output: Path, caplog) -> list[str]:
+    caplog.clear()
+    caplog.set_level("INFO")
+    run_status(StatusSettings(name="status", output=str(output)), output)
+    return caplog.messages
+
+
+def test_status_calls_running_only_what_a_run_is_at_work_on(tmp_path, caplog):
+    with sole_run(tmp_path), Ledger(tmp_path / LEDGER_FILE) as ledger:
+        ledger.put_scan(ScanRow("a", "/a", "running"))
+        assert "running" in status_lines(tmp_path, caplog)[0]
+    assert "stopped" in status_lines(tmp_path, caplog)[0]
+    (tmp_path / ".lock").unlink(missing_ok=True)
+    assert "stopped" in status_lines(tmp_path, caplog)[0]
+    assert not (tmp_path / ".lock").exists()
+
+
+def test_an_interruption_says_what_is_done(command, tmp_path, capsys, monkeypatch):
+    from lsvision.archive.driver import Driver
+
+    make_calibration(tmp_path / "c.json")
+    for name in ("a", "b"):
+        make_scan(tmp_path / "archive" / name, 40)
+    take = Driver._take
+
+    def interrupted(driver, scan, task, outcome):
+        take(driver, scan, task, outcome)
+        if driver._rows:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(Driver, "_take", interrupted)
+    options = (*REPROCESS, "archive=archive", "output=o", "engine.workers=1")
+    assert command(*options) == 130
+    assert capsys.readouterr().err.splitlines()[-1] == (
+        "interrupted: 1 of 2 scans are done, and finished strips of others are kept; "
+        "run the same command again to go on"
+    )
+    monkeypatch.setattr(Driver, "_take", take)
+    assert command(*options) == 0
+    assert len(list((tmp_path / "o").glob("*.zarr"))) == 2
+
+
+@pytest.mark.slow
+def test_ctrl_c_ends_the_program_with_130(tmp_path):
+    make_calibration(tmp_path / "c.json")
+    for number in range(20):
+        make_scan(tmp_path / "archive" / f"s{number}", 400, stereo=True)
+    options = [f"archive={tmp_path / 'archive'}", f"calibration={tmp_path / 'c.json'}", f"output={tmp_path / 'o'}"]
+    program = [sys.executable, "-m", "lsvision.run", "+experiment=reprocess", *options, "engine.workers=1"]
+    process = subprocess.Popen(
+        [*program, f"hydra.run.dir={tmp_path / 'run'}"], stderr=subprocess.PIPE, text=True, start_new_session=True
+    )
+    while process.poll() is None and not list((tmp_path / "o").glob("*.zarr")):
+        time.sleep(0.01)
+    os.killpg(process.pid, signal.SIGINT)
+    _, errors = process.communicate(timeout=100)
+    assert process.returncode == 130
+    assert errors.splitlines()[-1].startswith("interrupted: ")
+    assert "Traceback" not in errors
