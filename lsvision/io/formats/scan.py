@@ -10,10 +10,12 @@ import yaml
 from torch import Tensor
 
 from lsvision.errors import FileFormatError
+from lsvision.geometry import zero_disparity_mm
 from lsvision.io.atomic import partial_folder, write_text
 from lsvision.io.formats.encoder import read_encoder, write_encoder
 from lsvision.io.formats.rig import read_rig, write_rig
 from lsvision.io.formats.validation import named_file, read_entries, read_yaml
+from lsvision.io.images.depth_map import PlausibleDepth
 from lsvision.io.images.line_image import open_line_image
 from lsvision.io.images.tiff import write_line_image
 from lsvision.io.json_file import write_json
@@ -111,6 +113,8 @@ def read_scan(path: Path | str, *, repair_encoder: bool = False) -> Scan:
     images = {key: open_line_image(named) for key, named in files.items() if key in IMAGE_KEYS}
     check_images(file, rig, images)
     left = images["left"]
+    if "depth" in images:
+        images["depth"] = _plausible_depth(file, rig, images["depth"])
     encoder = files.get("encoder")
     return Scan(
         path=file.parent,
@@ -167,6 +171,19 @@ def write_scan(folder: Path | str, scan: NewScan) -> None:
             write_json(partial / name, content, strict=True)
         entries = {key: value for key, value in asdict(scan.entries()).items() if value is not None}
         write_text(partial / SCAN_FILE, yaml.safe_dump(entries, sort_keys=False))
+
+
+def _plausible_depth(file: Path, rig: Rig, stored: LineImage) -> PlausibleDepth:
+    """A scan's depth map without what the rig cannot have seen.
+
+    Raises:
+        FileFormatError: its values are in another unit, or no depths.
+    """
+    depth = PlausibleDepth(stored, zero_disparity_mm(rig))
+    problem = depth.unit_problem()
+    if problem is not None:
+        raise FileFormatError(file, problem, "depth")
+    return depth
 
 
 def check_images(file: Path, rig: Rig, images: Mapping[str, LineImage]) -> None:
