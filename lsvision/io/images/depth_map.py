@@ -1,11 +1,13 @@
 """A depth map from elsewhere: what the rig cannot have seen was not measured, and another unit is an error."""
 
+from contextlib import suppress
 from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from lsvision.errors import FileFormatError
 from lsvision.types import LineImage
 
 # Times the depth of zero disparity. Whatever lies beyond is a code for "no data", an infinity or a fault of the sensor.
@@ -45,9 +47,7 @@ class PlausibleDepth:
 
     def unit_problem(self) -> str | None:
         """What is wrong with the map's unit, judged by a few lines; None where they hold depths, or nothing at all."""
-        lines = self.shape[0]
-        places = sorted({(2 * i + 1) * lines // (2 * _SAMPLED_LINES) for i in range(_SAMPLED_LINES)})
-        z = torch.cat([self.stored.read(line, line + 1).flatten() for line in places])
+        z = self._sampled()
         z = z[torch.isfinite(z) & (z != 0)]
         if z.numel() == 0 or self._is_plausible(z).double().mean() >= _PLAUSIBLE_SHARE:
             return None
@@ -59,6 +59,15 @@ class PlausibleDepth:
         guess = "heights" if signed else self._unit_of(positive)
         looks = f"these look like {guess}" if guess else "these are no depths of this rig"
         return f"median {typical:.3g} where the rig sees {self.expected_mm:.0f} mm: expected depth in mm, {looks}"
+
+    def _sampled(self) -> Float[Tensor, " values"]:
+        """Values of a few lines; one that cannot be decoded says nothing here, and is an error where it is read."""
+        lines = self.shape[0]
+        sampled = [torch.empty(0)]
+        for line in sorted({(2 * i + 1) * lines // (2 * _SAMPLED_LINES) for i in range(_SAMPLED_LINES)}):
+            with suppress(FileFormatError):
+                sampled.append(self.stored.read(line, line + 1).flatten())
+        return torch.cat(sampled)
 
     def _unit_of(self, positive: Float[Tensor, " values"]) -> str | None:
         """The unit in which positive values are depths of the rig; "heights" where they are small and in none."""
