@@ -20,19 +20,26 @@ HEADER = ["line", "position_mm"]
 
 # A gap over which the object moved by less than this part of its usual advance was a halt, not a few lost readings.
 _STANDSTILL = 0.5
+_MANY = 1000  # times the usual advance of a line: no object moved by that, a reading is wrong
+_UNIT_FACTOR = 2.0  # between the advance of a line and the scan's pitch; a unit slip is more
+_UNITS = {1e6: "nm", 1e3: "um", 1e-1: "cm", 1 / 25.4: "inches", 1e-3: "m"}
 _CLOSE = 1e-6  # part of the way to the next good reading that lines of a halt are spread over
 
 logger = logging.getLogger(__name__)
 
 
-def read_encoder(path: Path | str, lines: int, *, repair: bool = False) -> Float[Tensor, " lines"]:
+def read_encoder(
+    path: Path | str, lines: int, *, line_pitch_mm: float | None = None, repair: bool = False
+) -> Float[Tensor, " lines"]:
     """Positions, mm, of the first ``lines`` lines of a log with the header ``line,position_mm``.
 
     Args:
+        line_pitch_mm: nominal pitch, which the advance of a line is compared with; None where there is none.
         repair: interpolate lines that are missing or break the increase, and log a warning, instead of raising.
 
     Raises:
-        FileFormatError: not such a log, shorter than the scan, or with faults that are not, or cannot be, repaired.
+        FileFormatError: not such a log, shorter than the scan, in another unit, or with faults that are not, or cannot
+            be, repaired.
     """
     path = Path(path)
     line, position = _parse(path)
@@ -40,6 +47,8 @@ def read_encoder(path: Path | str, lines: int, *, repair: bool = False) -> Float
     if lines - 1 not in line:
         last = f"ends at line {line.max()}" if line.size else "is empty"
         raise FileFormatError(path, f"the log {last}, the scan has {lines} lines")
+    if line_pitch_mm is not None and (problem := _unit_problem(line, position, line_pitch_mm)):
+        raise FileFormatError(path, problem)
     faults = _faults(line, position, lines)
     if not faults:
         return torch.from_numpy(position)
@@ -86,8 +95,37 @@ def _faults(line: NDArray[np.int64], position: NDArray[np.float64], lines: int) 
         "missing": np.setdiff1d(np.arange(lines), kept),
         "repeated": np.unique(line[again]),
         "not beyond the line before": kept[1:][advance <= 0],
+        f"more than {_MANY} times the usual advance beyond the line before": kept[1:][_jumps(kept, position[~again])],
     }
     return "; ".join(f"{_listed(found)} {kind}" for kind, found in faults.items() if found.size)
+
+
+def _unit_problem(line: NDArray[np.int64], position: NDArray[np.float64], line_pitch_mm: float) -> str | None:
+    """What is wrong with the unit of a log, in words; None where its usual advance is about the pitch."""
+    steps = _usual_advance(line, position)
+    half = max(len(line) // 2, 1)  # over half the log neither steps of the counter nor wrong readings weigh
+    elapsed = np.maximum(line[half:] - line[:-half], 1)
+    slope = float(np.median((position[half:] - position[:-half]) / elapsed)) if len(line) > half else steps
+    ratios = [rate / line_pitch_mm for rate in (steps, slope)]
+    if steps == 0 or any(1 / _UNIT_FACTOR <= ratio <= _UNIT_FACTOR for ratio in ratios):
+        return None
+    units = [name for factor, name in _UNITS.items() if 1 / _UNIT_FACTOR <= ratios[0] / factor <= _UNIT_FACTOR]
+    guess = f"are these {units[0]}?" if units else "does the log belong to this scan?"
+    return f"expected about {line_pitch_mm:g} mm a line, the scan's line_pitch_mm, got {steps:g} (median): {guess}"
+
+
+def _usual_advance(line: NDArray[np.int64], position: NDArray[np.float64]) -> float:
+    """Median advance of a line, mm, over the lines that advanced; 0 where none did."""
+    elapsed, advance = np.diff(line), np.diff(position)
+    forward = (elapsed > 0) & (advance > 0)
+    return float(np.median(advance[forward] / elapsed[forward])) if forward.any() else 0.0
+
+
+def _jumps(line: NDArray[np.int64], position: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Which readings, but the first, lie much further beyond the one before than an object can have moved."""
+    usual = _usual_advance(line, position)
+    jumps: NDArray[np.bool_] = np.diff(position) > _MANY * usual * np.diff(line)
+    return jumps
 
 
 def _listed(lines: NDArray[np.int64]) -> str:
@@ -106,6 +144,8 @@ def _repaired(path: Path, line: NDArray[np.int64], position: NDArray[np.float64]
     good = _longest_increasing(position)
     step = np.diff(position[good], prepend=-np.inf)
     good = good[step > _CLOSE * np.median(step[1:])] if len(good) > 1 else good  # rounding is no progress
+    pieces = np.split(good, np.flatnonzero(_jumps(line[good], position[good])) + 1)
+    good = max(pieces, key=len)  # what lies beyond a jump is wrong, be it the last reading alone
     if line[good[0]] != 0 or line[good[-1]] != lines - 1:
         raise FileFormatError(path, "cannot be repaired: the first or the last line has no good reading")
     elapsed, advance = np.diff(line[good]), np.diff(position[good])

@@ -115,15 +115,13 @@ def read_scan(path: Path | str, *, repair_encoder: bool = False) -> Scan:
     left = images["left"]
     if "depth" in images:
         images["depth"] = _plausible_depth(file, rig, images["depth"])
-    encoder = files.get("encoder")
+    pitch = entries.line_pitch_mm
+    log = files.get("encoder")
+    positions = read_encoder(log, left.shape[0], line_pitch_mm=pitch, repair=repair_encoder) if log else None
     return Scan(
         path=file.parent,
         rig=rig,
-        travel=Travel(
-            line_pitch_mm=entries.line_pitch_mm,
-            positions_mm=read_encoder(encoder, left.shape[0], repair=repair_encoder) if encoder else None,
-            transport=entries.transport or "forward",
-        ),
+        travel=Travel(pitch, positions, entries.transport or "forward"),
         images=StereoPair(left, images["right"]) if "right" in images else DepthView(left, images["depth"]),
         color_registered=entries.color_registered is not False,
         attributes={name: str(value) for name, value in (entries.attributes or {}).items()},
