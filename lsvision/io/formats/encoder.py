@@ -21,6 +21,8 @@ HEADER = ["line", "position_mm"]
 # A gap over which the object moved by less than this part of its usual advance was a halt, not a few lost readings.
 _STANDSTILL = 0.5
 _MANY = 1000  # times the usual advance of a line: no object moved by that, a reading is wrong
+_COARSE = 1.5  # times the pitch: a counter of this step repeats readings although the object moves
+_COUNT_ERROR = 0.01  # of a step, by which multiples may differ as they are rounded in the file
 _UNIT_FACTOR = 2.0  # between the advance of a line and the scan's pitch; a unit slip is more
 _UNITS = {1e6: "nm", 1e3: "um", 1e-1: "cm", 1 / 25.4: "inches", 1e-3: "m"}
 _CLOSE = 1e-6  # part of the way to the next good reading that lines of a halt are spread over
@@ -54,6 +56,11 @@ def read_encoder(
         return torch.from_numpy(position)
     if not repair:
         raise FileFormatError(path, f"{faults}; repair was not asked for")
+    if line_pitch_mm is not None:
+        resolution = counter_resolution(line, position)
+        if resolution > _COARSE * line_pitch_mm:
+            faults = f"{faults}; the readings are multiples of {resolution:g} mm, between which lines are interpolated"
+            position = without_counter_steps(line, position, resolution / line_pitch_mm)
     repaired = _repaired(path, line, position, lines)
     logger.warning("%s: repaired by interpolation: %s", path, faults)
     return torch.from_numpy(repaired)
@@ -102,21 +109,22 @@ def _faults(line: NDArray[np.int64], position: NDArray[np.float64], lines: int) 
 
 def _unit_problem(line: NDArray[np.int64], position: NDArray[np.float64], line_pitch_mm: float) -> str | None:
     """What is wrong with the unit of a log, in words; None where its usual advance is about the pitch."""
-    steps = _usual_advance(line, position)
-    half = max(len(line) // 2, 1)  # over half the log neither steps of the counter nor wrong readings weigh
-    elapsed = np.maximum(line[half:] - line[:-half], 1)
-    slope = float(np.median((position[half:] - position[:-half]) / elapsed)) if len(line) > half else steps
-    ratios = [rate / line_pitch_mm for rate in (steps, slope)]
-    if steps == 0 or any(1 / _UNIT_FACTOR <= ratio <= _UNIT_FACTOR for ratio in ratios):
+    advance = _usual_advance(line, position)
+    ratio = advance / line_pitch_mm
+    if advance == 0 or 1 / _UNIT_FACTOR <= ratio <= _UNIT_FACTOR:
         return None
-    units = [name for factor, name in _UNITS.items() if 1 / _UNIT_FACTOR <= ratios[0] / factor <= _UNIT_FACTOR]
+    units = [name for factor, name in _UNITS.items() if 1 / _UNIT_FACTOR <= ratio / factor <= _UNIT_FACTOR]
     guess = f"are these {units[0]}?" if units else "does the log belong to this scan?"
-    return f"expected about {line_pitch_mm:g} mm a line, the scan's line_pitch_mm, got {steps:g} (median): {guess}"
+    return f"expected about {line_pitch_mm:g} mm a line, the scan's line_pitch_mm, got {advance:g} (median): {guess}"
 
 
 def _usual_advance(line: NDArray[np.int64], position: NDArray[np.float64]) -> float:
-    """Median advance of a line, mm, over the lines that advanced; 0 where none did."""
-    elapsed, advance = np.diff(line), np.diff(position)
+    """Median advance of a line, mm, from one change of the reading to the next; 0 where it never advances.
+
+    Neither a halt nor the repeated readings of a coarse counter make it smaller.
+    """
+    changed = np.append(True, np.diff(position) != 0)
+    elapsed, advance = np.diff(line[changed]), np.diff(position[changed])
     forward = (elapsed > 0) & (advance > 0)
     return float(np.median(advance[forward] / elapsed[forward])) if forward.any() else 0.0
 
@@ -158,6 +166,42 @@ def _repaired(path: Path, line: NDArray[np.int64], position: NDArray[np.float64]
     knots, values = np.append(line[good], knots), np.append(position[good], values)
     order = np.argsort(knots)
     return np.interp(np.arange(lines), knots[order], values[order])
+
+
+def counter_resolution(line: NDArray[np.int64], position: NDArray[np.float64]) -> float:
+    """Step, mm, of a log whose readings all are multiples of one, as those of a counter; 0 where they are not."""
+    advance = np.abs(np.diff(position))
+    moved = advance[advance > 0]
+    if moved.size == 0:
+        return 0.0
+    step = float(moved.min())
+    counts = moved / step
+    return step if np.abs(counts - counts.round()).max() < _COUNT_ERROR else 0.0
+
+
+def without_counter_steps(
+    line: NDArray[np.int64], position: NDArray[np.float64], lines_a_step: float
+) -> NDArray[np.float64]:
+    """Readings of a coarse counter with the advance of each step spread over its lines.
+
+    A reading stands for the middle of the lines that share it. Of the first and the last nobody knows how many lines
+    they lack, so that the steps beside them are continued. A reading that more lines share than twice the usual number
+    is a halt: its lines keep it, except for half a step at either end.
+    """
+    starts = np.flatnonzero(np.append(True, np.diff(position) != 0))
+    first, last = line[starts], line[np.append(starts[1:], len(line)) - 1]
+    halt = last - first + 1 > 2 * np.ceil(lines_a_step)
+    inset = np.where(halt, lines_a_step / 2 - 0.5, (last - first) / 2)
+    known = halt.copy()
+    known[1:-1] = True
+    if known.sum() < 2:
+        return position
+    knots = np.stack([first + inset, last - inset], axis=1)[known].ravel()
+    values = np.repeat(position[starts][known], 2)
+    repaired = np.interp(line, knots, values)
+    rate = _usual_advance(line, position)
+    repaired += rate * np.minimum(line - knots[0], 0) + rate * np.maximum(line - knots[-1], 0)
+    return np.asarray(repaired)
 
 
 def _longest_increasing(values: NDArray[np.float64]) -> NDArray[np.int64]:

@@ -76,6 +76,33 @@ def test_halts_and_other_speeds_are_no_other_unit(tmp_path: Path) -> None:
         read_encoder(log(tmp_path, list(enumerate(steps.tolist()))), 100, line_pitch_mm=0.5)
 
 
+@pytest.mark.parametrize("step", [1.0, 1.7, 4.0])
+def test_a_coarse_counter_does_not_halt(tmp_path: Path, step: float, caplog) -> None:
+    true = np.cumsum(0.5 + 0.1 * np.sin(np.arange(400) / 30))
+    file = log(tmp_path, list(enumerate((np.round(true / step) * step).tolist())))
+    with pytest.raises(FileFormatError, match="not beyond the line before"):
+        read_encoder(file, 400, line_pitch_mm=0.5)
+    repaired = read_encoder(file, 400, line_pitch_mm=0.5, repair=True).numpy()
+    assert f"multiples of {step:g} mm" in caplog.text
+    assert np.abs(repaired - true).max() < 0.6 * step
+    assert np.abs(repaired - true)[20:-20].max() < 0.3 * step
+    advance = np.diff(repaired)
+    assert advance.min() > 0.2
+    assert advance.max() < 1.0
+
+
+def test_a_coarse_counter_that_halts(tmp_path: Path) -> None:
+    true = np.arange(300) * 0.5
+    true[100:200] = true[100]
+    true[200:] = true[100] + 0.5 * np.arange(1, 101)
+    file = log(tmp_path, list(enumerate((np.round(true / 2) * 2).tolist())))
+    repaired = read_encoder(file, 300, line_pitch_mm=0.5, repair=True).numpy()
+    assert (np.diff(repaired) > 0).all()
+    moving = np.r_[0:100, 200:300]
+    assert np.abs(repaired - true)[moving].max() < 2.0
+    assert (np.diff(repaired)[110:190] < 1e-3).sum() >= 75  # nothing is taken from the halt
+
+
 @pytest.mark.parametrize("at", [3, 99])
 def test_a_jump_is_refused_and_repaired_only_between_good_readings(tmp_path: Path, at: int) -> None:
     position = np.arange(100) * 0.5
