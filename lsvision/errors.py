@@ -39,6 +39,10 @@ class CalibrationError(LsvisionError):
     """A calibration that cannot be computed, or does not fit the scan that it should correct."""
 
 
+class NothingMeasuredError(LsvisionError):
+    """A product of which next to nothing was measured: its scan, calibration or options do not fit each other."""
+
+
 class ConfigError(LsvisionError):
     """An option with an impossible value; the message names the option."""
 

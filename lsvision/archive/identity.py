@@ -56,5 +56,6 @@ def product_key(depth: str, calibration_sha256: str, config: CorrectionConfig, r
 def options_without_strips(config: CorrectionConfig) -> dict[str, Any]:
     """Options of a correction that a product's cells depend on."""
     options = asdict(config)
-    del options["strip_rows"]
+    for name in ("strip_rows", "min_measured_share"):
+        del options[name]
     return options

@@ -24,6 +24,7 @@ from lsvision.archive.work import (
     StripResult,
     Work,
 )
+from lsvision.errors import NothingMeasuredError
 from lsvision.io import create_product, naming_full_disk
 
 WORK_FOLDER = ".work"
@@ -76,6 +77,7 @@ class ScanJob:
 
         Raises:
             FileFormatError: the scan cannot be read any more, or its product would replace that of another scan.
+            NothingMeasuredError: less of the product was measured than ``min_measured_share``.
             WriteError: the disk is full.
         """
         return self._hashing() or self._matching() or self._correcting() or self._finishing()
@@ -107,12 +109,11 @@ class ScanJob:
             else:
                 shutil.rmtree(other, ignore_errors=True)
         strips = self._place.ledger.strips(self.planned.key)
-        cells = self.planned.grid.rows * self.planned.grid.columns
         row = replace(
             self._row,
             status="done",
             seconds=sum(strip.seconds for strip in strips),
-            measured_share=self._measured_cells() / cells,
+            measured_share=self._measured_share(),
         )
         self._place.ledger.put_scan(row)
         return row
@@ -168,6 +169,12 @@ class ScanJob:
     def _finishing(self) -> list[Task]:
         if self._is_renamed():
             return []
+        measured, least = self._measured_share(), self.planned.correction.min_measured_share
+        if measured < least:
+            raise NothingMeasuredError(
+                f"{self.planned.files.path}: {measured:.2%} of the product's cells were measured, expected at least "
+                f"{least:.2%} (correction.min_measured_share); do height_range_mm and the rig fit the scan?"
+            )
         finish = FinishProduct(self._product, self._strips_key, self._measured_cells(), self._place.verify)
         return [Task(self.planned.key, finish)]
 
@@ -189,6 +196,9 @@ class ScanJob:
     def _measured_cells(self) -> int:
         strips = self._place.ledger.finished_strips(self.planned.key, "product", self._strips_key)
         return measured_cells(strips.values()).count
+
+    def _measured_share(self) -> float:
+        return self._measured_cells() / (self.planned.grid.rows * self.planned.grid.columns)
 
     @property
     def _row(self) -> ScanRow:

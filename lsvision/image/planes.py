@@ -15,9 +15,17 @@ _SMALLEST_SHARE = 0.25  # of the window that must lie on the plane
 
 @dataclass(frozen=True)
 class LocalPlanes:
-    """Value of the plane at each point, its variance from the residuals, and whether enough of the window lay on it."""
+    """Planes at their points.
+
+    Attributes:
+        value: of the plane at the point.
+        slope: of the plane along columns and along lines, per px: by it an error of the point becomes one of the value.
+        variance: of the value where the point is exact, from the residuals and the rounding of the map.
+        valid: whether enough of the window lay on the plane.
+    """
 
     value: Float[Tensor, " points"]
+    slope: Float[Tensor, "points 2"]
     variance: Float[Tensor, " points"]
     valid: Bool[Tensor, " points"]
 
@@ -58,6 +66,10 @@ class WeightedPlanes:
         """The planes at their points."""
         return self.coefficients[:, 0, 0]
 
+    def slope(self) -> Float[Tensor, "points 2"]:
+        """The planes' slopes along columns and along lines."""
+        return self.coefficients[:, 1:, 0]
+
     def value_variance(self) -> Float[Tensor, " points"]:
         """Variance of the value, per variance of a pixel."""
         return torch.linalg.inv(self.normal)[:, 0, 0]
@@ -80,21 +92,63 @@ def fit_local_planes(
         Values, valid where wanted and at least a quarter of the window lay on the plane.
     """
     windows = read_map_windows(image, torch.where(wanted[:, None], position, 0.0), wanted, half_size)
-    kept = _without_outliers(windows).to(windows.values.dtype)
+    rounding = Rounding.of(windows, torch.finfo(image.dtype).eps)
+    kept = _without_outliers(windows, rounding.step).to(windows.values.dtype)
     planes = WeightedPlanes.through(windows, kept)
     count = kept.sum(-1)
     variance = (kept * planes.residual(windows).square()).sum(-1) / (count - 3).clamp(min=1)
     valid = wanted & (count >= _SMALLEST_SHARE * kept.shape[1])
-    return LocalPlanes(planes.value(), variance * planes.value_variance(), valid)
+    variance = variance * planes.value_variance() + rounding.variance(windows.values, kept > 0)
+    return LocalPlanes(planes.value(), planes.slope(), variance, valid)
 
 
-def _without_outliers(windows: MapWindows) -> Tensor:
-    """Valid pixels (points, pixels) near the plane of a robust fit, by iterated reweighting."""
+@dataclass(frozen=True)
+class Rounding:
+    """Rounding of a map's values: to steps of ``step``, and to the ``precision`` of its numbers at least."""
+
+    step: Float[Tensor, ""]
+    precision: Float[Tensor, ""]
+
+    @classmethod
+    def of(cls, windows: MapWindows, eps: float) -> "Rounding":
+        """The step is the smallest difference between any two values; a map that is the same everywhere shows none.
+
+        Args:
+            eps: relative precision of the map's numbers.
+        """
+        values = windows.values[windows.valid]
+        if values.numel() == 0:
+            return cls(values.new_zeros(()), values.new_zeros(()))
+        precision = eps * values.abs().max()
+        differences = values.unique().diff()
+        return cls(torch.maximum(differences.min(), precision) if differences.numel() else precision, precision)
+
+    def variance(self, values: Tensor, kept: Tensor) -> Float[Tensor, " points"]:
+        """Variance that rounding adds to the value of a plane and that the residuals do not show.
+
+        All pixels of a flat window are rounded alike, so that the plane is as wrong as one of them. Over a window that
+        spans m steps the errors cancel, less than those of independent pixels do: slopes near a whole number of steps
+        leave rows that are rounded alike.
+
+        Args:
+            values: pixels of windows, (points, pixels).
+            kept: those that the plane was fitted to.
+        """
+        highest = torch.where(kept, values, -torch.inf).amax(-1)
+        lowest = torch.where(kept, values, torch.inf).amin(-1)
+        spanned = ((highest - lowest) / self.step).clamp(min=1)
+        return (self.step.square() / spanned + self.precision.square()) / 12
+
+
+def _without_outliers(windows: MapWindows, step: Tensor) -> Tensor:
+    """Valid pixels (points, pixels) near the plane of a robust fit, by iterated reweighting.
+
+    Rounding to steps is no outlier: its errors are uniform, with the median step / 4.
+    """
     weight = windows.valid.to(windows.values.dtype)
     for _ in range(_ROUNDS):
         residual = WeightedPlanes.through(windows, weight).residual(windows)
-        # Rounding is not an outlier.
-        median = torch.where(windows.valid, residual, torch.nan).nanmedian(-1, keepdim=True).values + 1e-9
+        median = torch.where(windows.valid, residual, torch.nan).nanmedian(-1, keepdim=True).values + step / 4 + 1e-9
         # Cauchy's weights: a cut at once would keep outliers that have drawn the plane halfway to them.
         weight = windows.valid / (1.0 + (residual / median).square())
     return windows.valid & (residual <= _OUTLIER * median)

@@ -1,16 +1,24 @@
 """One scan: the same product as from an archive, byte for byte, and never in the place of another scan's."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from lsvision.archive import EngineConfig, plan_one, process_one
-from lsvision.archive.work import CorrectStrip
+from lsvision.archive.work import CorrectStrip, FinishProduct
 from lsvision.errors import LsvisionError, ScansFailedError
 from lsvision.experiments.correct import CorrectSettings, run_correct
 from lsvision.experiments.reprocess import ReprocessSettings, run_reprocess
 from lsvision.io import read_product
-from tests.archive.archives import PROCESSING, assert_same_products, make_calibration, make_scan, with_strip_rows
+from tests.archive.archives import (
+    PROCESSING,
+    assert_same_products,
+    make_calibration,
+    make_scan,
+    process,
+    with_strip_rows,
+)
 
 
 def correct(scan: Path, calibration: Path, output: Path) -> None:
@@ -108,6 +116,23 @@ def test_what_is_no_product_is_not_replaced_and_nothing_is_computed(archive, cal
     with pytest.raises(LsvisionError, match=r"a\.zarr: expected a new or empty folder, or one with zarr.json"):
         correct(archive / "a", calibration, tmp_path / "o")
     assert content(tmp_path / "o") == {"a.zarr/notes.txt": b"keep"}
+
+
+def test_a_product_of_which_nothing_was_measured_is_an_error(archive, calibration, tmp_path):
+    """Surfaces outside the height range: a failed row in an archive, an exception for one scan, and no product."""
+    unseen = replace(PROCESSING, correction=replace(PROCESSING.correction, height_range_mm=(30.0, 60.0)))
+    message = r"b: 0\.00% of the product's cells were measured, expected at least 1\.00% \(correction\.min_measured"
+    with pytest.raises(LsvisionError, match=message):
+        process_one(plan_one(archive / "b", calibration, unseen), unseen, tmp_path / "one", ignore)
+    assert list((tmp_path / "one").iterdir()) == []
+    rows, _ = process(archive, calibration, tmp_path / "many", processing=unseen)
+    assert {row.status for row in rows} == {"failed"}
+    assert not list((tmp_path / "many").glob("*.zarr"))
+    # Wanted all the same, it is there without computing anything again.
+    wanted = replace(unseen, correction=replace(unseen.correction, min_measured_share=0.0))
+    rows, engine = process(archive, calibration, tmp_path / "many", processing=wanted)
+    assert {row.status for row in rows} == {"done"}
+    assert {type(task.work) for task in engine.tasks} == {FinishProduct}
 
 
 def test_a_scan_file_stands_for_its_folder(archive, calibration, tmp_path):

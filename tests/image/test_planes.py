@@ -41,6 +41,7 @@ def test_batch_equals_loop(points):
 def test_exact_on_a_plane(points):
     planes = fit(plane(), points)
     torch.testing.assert_close(planes.value, at(points), rtol=0, atol=1e-6)
+    torch.testing.assert_close(planes.slope, torch.tensor([[0.013, -0.021]]).double().expand(12, 2), rtol=0, atol=1e-6)
     assert (planes.variance < 1e-12).all()
     assert planes.valid.all()
 
@@ -88,6 +89,34 @@ def test_variance_predicts_the_error():
         errors.append(planes.value - at(points[:1]))
         variances.append(planes.variance)
     assert abs(torch.cat(errors).std() / torch.cat(variances).mean().sqrt() - 1) < 0.15
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.005])
+@pytest.mark.parametrize("slope", [0.001, 0.01, 0.05])
+@pytest.mark.parametrize("step", [0.05, 0.2])
+def test_variance_covers_rounding(step, slope, noise):
+    """Whether a window lies within one step, where no residual shows the rounding, or spans many."""
+    points = 6 + torch.rand(30, 2).double() * torch.tensor([66.0, 46.0])
+    v, u = torch.meshgrid(torch.arange(60).double(), torch.arange(80).double(), indexing="ij")
+    errors, variances = [], []
+    for angle in torch.linspace(0.3, 6.0, 12).double():
+        along_u, along_v, middle = slope * angle.cos(), slope * angle.sin(), 800 + torch.rand(1).double()
+        exact = middle + along_u * (u - 40) + along_v * (v - 30) + noise * torch.randn(60, 80).double()
+        planes = fit(((exact / step).round() * step).float(), points)
+        errors.append(planes.value - (middle + along_u * (points[:, 0] - 40) + along_v * (points[:, 1] - 30)))
+        variances.append(planes.variance)
+        assert planes.valid.all()
+    error, sigma = torch.cat(errors), torch.cat(variances).sqrt()
+    if slope > 0.001 or step < 0.2:  # else most maps are one step, and show none
+        assert (error / sigma).square().mean().sqrt() < 1.5
+    assert error.abs().max() < 0.6 * step
+
+
+def test_the_precision_of_numbers_is_a_floor(points):
+    planes = fit(plane().float(), points)
+    error = (planes.value - at(points)).abs()
+    assert (error <= 3 * planes.variance.sqrt()).all()
+    assert (planes.variance.sqrt() > 1e-5).all()
 
 
 def test_empty_thin_and_unwanted_windows_are_not_seen():

@@ -10,10 +10,12 @@ import yaml
 from torch import Tensor
 
 from lsvision.errors import FileFormatError
+from lsvision.geometry import zero_disparity_mm
 from lsvision.io.atomic import partial_folder, write_text
 from lsvision.io.formats.encoder import read_encoder, write_encoder
 from lsvision.io.formats.rig import read_rig, write_rig
 from lsvision.io.formats.validation import named_file, read_entries, read_yaml
+from lsvision.io.images.depth_map import PlausibleDepth
 from lsvision.io.images.line_image import open_line_image
 from lsvision.io.images.tiff import write_line_image
 from lsvision.io.json_file import write_json
@@ -111,15 +113,15 @@ def read_scan(path: Path | str, *, repair_encoder: bool = False) -> Scan:
     images = {key: open_line_image(named) for key, named in files.items() if key in IMAGE_KEYS}
     check_images(file, rig, images)
     left = images["left"]
-    encoder = files.get("encoder")
+    if "depth" in images:
+        images["depth"] = _plausible_depth(file, rig, images["depth"])
+    pitch = entries.line_pitch_mm
+    log = files.get("encoder")
+    positions = read_encoder(log, left.shape[0], line_pitch_mm=pitch, repair=repair_encoder) if log else None
     return Scan(
         path=file.parent,
         rig=rig,
-        travel=Travel(
-            line_pitch_mm=entries.line_pitch_mm,
-            positions_mm=read_encoder(encoder, left.shape[0], repair=repair_encoder) if encoder else None,
-            transport=entries.transport or "forward",
-        ),
+        travel=Travel(pitch, positions, entries.transport or "forward"),
         images=StereoPair(left, images["right"]) if "right" in images else DepthView(left, images["depth"]),
         color_registered=entries.color_registered is not False,
         attributes={name: str(value) for name, value in (entries.attributes or {}).items()},
@@ -167,6 +169,19 @@ def write_scan(folder: Path | str, scan: NewScan) -> None:
             write_json(partial / name, content, strict=True)
         entries = {key: value for key, value in asdict(scan.entries()).items() if value is not None}
         write_text(partial / SCAN_FILE, yaml.safe_dump(entries, sort_keys=False))
+
+
+def _plausible_depth(file: Path, rig: Rig, stored: LineImage) -> PlausibleDepth:
+    """A scan's depth map without what the rig cannot have seen.
+
+    Raises:
+        FileFormatError: its values are in another unit, or no depths.
+    """
+    depth = PlausibleDepth(stored, zero_disparity_mm(rig))
+    problem = depth.unit_problem()
+    if problem is not None:
+        raise FileFormatError(file, problem, "depth")
+    return depth
 
 
 def check_images(file: Path, rig: Rig, images: Mapping[str, LineImage]) -> None:

@@ -1,6 +1,7 @@
 """A folder of equally wide frames, stacked in natural order."""
 
 import re
+from itertools import pairwise
 from pathlib import Path
 
 import imagecodecs
@@ -14,6 +15,8 @@ from lsvision.io.images.bands import BandedImage
 from lsvision.io.images.tiff import TiffBands
 
 FRAME_SUFFIXES = (".png", ".bmp", ".tif", ".tiff")
+# Of images that are no frames; one among frames may stand for a frame that is not there.
+_OTHER_IMAGES = (".jpg", ".jpeg", ".jp2", ".webp", ".gif")
 
 # By the first two bytes. Pillow's Image.open rejects a frame of 30 000 x 7142 px as a decompression bomb, and its limit
 # is global to the process; these classes read the header alone, of any size.
@@ -26,7 +29,7 @@ class FrameBands:
     Opening the folder decodes its first frame and reads the headers of all.
 
     Raises:
-        FileFormatError: no frames, a damaged one, or frames of different width.
+        FileFormatError: no frames, a damaged or a missing one, or frames of different kind or width.
     """
 
     def __init__(self, path: Path) -> None:
@@ -35,6 +38,7 @@ class FrameBands:
         if not frames:
             raise FileFormatError(path, f"expected a Zarr array, or frames that end in {', '.join(FRAME_SUFFIXES)}")
         self._frames = sorted(frames, key=_natural)
+        _check_kinds(path, self._frames)
         sizes = [_frame_size(frame) for frame in self._frames]
         for frame, (_, width) in zip(self._frames, sizes, strict=True):
             if width != sizes[0][1]:
@@ -43,6 +47,7 @@ class FrameBands:
                 )
         first = _decode_frame(self._frames[0])
         self.edges = np.cumsum([0, *(lines for lines, _ in sizes)], dtype=np.int64)
+        _check_sequence(path, self._frames, self.edges[:-1])
         self.layout = (int(self.edges[-1]), first.shape[1], first.shape[2])
         self.dtype = first.dtype
 
@@ -57,6 +62,38 @@ class FrameBands:
 def _natural(file: Path) -> list[tuple[int, str]]:
     """Sorting key by which frame 9 comes before frame 10."""
     return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", file.name)]
+
+
+def _check_kinds(folder: Path, frames: list[Path]) -> None:
+    kind = frames[0].suffix.lower()[:4]  # .tif and .tiff are one kind
+    for file in sorted(folder.iterdir()):
+        suffix = file.suffix.lower()
+        if suffix in (*FRAME_SUFFIXES, *_OTHER_IMAGES) and file.name[0] != "." and suffix[:4] != kind:
+            raise FileFormatError(file, f"expected frames of one kind only, as {frames[0].name} is")
+
+
+def _check_sequence(folder: Path, frames: list[Path], first_lines: NDArray[np.int64]) -> None:
+    """Check that frames are numbered one by one, or by their first lines: a lost one would move all behind it.
+
+    Names may hold further numbers, as a time, if one of them counts.
+    """
+    if len(frames) == 1:
+        return
+    if len({re.sub(r"\d+", "#", frame.stem) for frame in frames}) > 1:
+        raise FileFormatError(folder, f"expected frames whose names differ in a number only, as {frames[0].name}")
+    columns = np.array([[int(number) for number in re.findall(r"\d+", frame.stem)] for frame in frames], dtype=object).T
+    steps = [np.diff(column) for column in columns]
+    if any((step == 1).all() or (step == np.diff(first_lines)).all() for step in steps):
+        return
+    varying = [column for column, step in zip(columns, steps, strict=True) if (step != 0).any()]
+    if len(varying) != 1:
+        raise FileFormatError(folder, f"expected frames that are numbered one by one, as {frames[0].name}")
+    gaps = [(low + 1, high - 1) for low, high in pairwise(varying[0].tolist()) if high != low + 1]
+    shown = ", ".join(str(low) if low == high else f"{low}-{high}" for low, high in gaps[:5] if low <= high)
+    problem = f"frames {shown} are missing" if shown else "frames with equal numbers"
+    raise FileFormatError(
+        folder, f"{problem}{', ...' if len(gaps) > 5 else ''} ({frames[0].name} to {frames[-1].name})"
+    )
 
 
 def _frame_size(file: Path) -> tuple[int, int]:

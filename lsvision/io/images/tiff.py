@@ -71,6 +71,12 @@ class TiffBands:
             raise FileFormatError(self.path, "expected interleaved channels, got separate colour planes")
         if page.photometric.name not in ("MINISBLACK", "RGB", "YCBCR"):
             raise FileFormatError(self.path, f"expected a grey or RGB image, got {page.photometric.name}")
+        orientation = page.tags.valueof("Orientation", default=1)
+        if orientation != 1:
+            problem = (
+                f"expected the first line at the top and the first column at the left, got orientation {orientation}"
+            )
+            raise FileFormatError(self.path, problem)
         if page.imagedepth != 1 or page.dtype is None:
             raise FileFormatError(self.path, "expected a two-dimensional image of plain numbers")
         self.layout = (page.imagelength, page.imagewidth, page.samplesperpixel)

@@ -21,7 +21,8 @@ class ZarrBands:
     """The rows of chunks of a Zarr array ``(lines, width)`` or ``(lines, width, channels)``.
 
     Raises:
-        FileFormatError: a group, damaged metadata, or an array of another number of dimensions.
+        FileFormatError: a group, damaged metadata, an array of another number of dimensions, or an image of which
+            chunks are missing: they would read as black. A float map has none where nothing was measured.
     """
 
     def __init__(self, path: Path) -> None:
@@ -35,6 +36,9 @@ class ZarrBands:
             raise FileFormatError(path, f"expected an array (lines, width, channels), got shape {shape}")
         self.layout = (shape[0], shape[1], shape[2] if len(shape) == 3 else 1)
         self.dtype = np.dtype(self._array.dtype).newbyteorder("=")
+        missing = self._array.nchunks - self._array.nchunks_initialized if self.dtype.kind != "f" else 0
+        if missing > 0:
+            raise FileFormatError(path, f"{missing} of {self._array.nchunks} chunks are missing")
         self.edges = even_edges(shape[0], self._array.chunks[0])
 
     def __reduce__(self) -> tuple[type, tuple[Path]]:

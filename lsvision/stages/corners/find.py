@@ -92,7 +92,10 @@ def _triangulated(scan: Scan, left: DetectedCorners, right: DetectedCorners, con
 
 
 def _from_depth_map(scan: Scan, left: DetectedCorners, depth: LineImage, config: CornersConfig) -> _Measured:
-    """From one image and a depth map: z of a plane fitted around each corner."""
+    """From one image and a depth map: z of a plane fitted around each corner.
+
+    On a tilted board an error of the corner in the image is one in depth as well, by the slope of the plane.
+    """
     column, line = left.position.unbind(-1)
     half_columns = max(2, round(config.depth_window_mm / 2 / object_pitch_mm(scan.rig)))
     half_lines = max(2, round(config.depth_window_mm / 2 / abs(scan.travel.line_pitch_mm)))
@@ -103,7 +106,11 @@ def _from_depth_map(scan: Scan, left: DetectedCorners, depth: LineImage, config:
     by_column_and_depth = depth_map_jacobian(scan.rig, column, z)
     by_pixel = _point_jacobian(by_column_and_depth[..., 0], _pitch_at(scan.travel, line))
     by_depth = torch.stack([slope, torch.zeros_like(z), torch.ones_like(z)], -1)[..., None]
-    covariance = by_pixel @ left.covariance @ by_pixel.mT + by_depth @ by_depth.mT * planes.variance[:, None, None]
+    by_pixel = by_pixel + by_depth @ planes.slope[:, None, :]
+    # Seen in perspective, z of a tilted board is curved along the columns by 2 slope² / z: the plane lies that far off.
+    curvature = planes.slope[:, 0].square() / z * (half_columns**2 / 3)
+    variance = planes.variance + curvature.square()
+    covariance = by_pixel @ left.covariance @ by_pixel.mT + by_depth @ by_depth.mT * variance[:, None, None]
     return _Measured(points, covariance, left.valid & planes.valid)
 
 

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 from lsvision.image.resampling import Interpolation, Resampler
-from lsvision.schema import Checked, Interval, NonNegativeInt, Positive, PositiveInt
+from lsvision.schema import Checked, Interval, NonNegativeInt, Positive, PositiveInt, Share
 
 
 @dataclass(frozen=True)
@@ -17,7 +17,8 @@ class CorrectionConfig(Checked):
     of the cameras no longer sees it. Holes of up to ``bridge_px`` samples are bridged for colour; their height stays
     invalid. Depths outside ``height_range_mm`` count as not measured; the wider it is, the larger the product. With
     ``uncertainty`` each cell also gets the standard deviation of its position; ``disparity_sigma_px`` is that of the
-    matching, where the depth comes without one.
+    matching, where the depth comes without one. A product of which less than ``min_measured_share`` of the cells was
+    measured is an error.
     """
 
     pitch_mm: Positive | None = None
@@ -29,3 +30,4 @@ class CorrectionConfig(Checked):
     height_range_mm: Interval = (-60.0, 60.0)
     uncertainty: bool = False
     disparity_sigma_px: Positive = 0.09
+    min_measured_share: Share = 0.01

@@ -49,6 +49,74 @@ def test_faults_are_reported_with_their_lines(tmp_path: Path, rows: list, messag
 
 
 @pytest.mark.parametrize(
+    ("factor", "message"),
+    [
+        (1000.0, r"expected about 0.5 mm a line, the scan's line_pitch_mm, got 500 \(median\): are these um\?"),
+        (1e-3, r"are these m\?"),
+        (0.1, r"are these cm\?"),
+        (5.0, r"got 2.5 \(median\): does the log belong to this scan"),
+        (0.4, "does the log belong to this scan"),
+    ],
+)
+@pytest.mark.parametrize("repair", [False, True])
+def test_another_unit_is_refused(tmp_path: Path, factor: float, message: str, repair: bool) -> None:
+    position = np.arange(100) * 0.5
+    position[40:60] = position[40]  # a halt
+    file = log(tmp_path, list(enumerate((factor * position).tolist())))
+    with pytest.raises(FileFormatError, match=rf"encoder\.csv: .*{message}"):
+        read_encoder(file, 100, line_pitch_mm=0.5, repair=repair)
+
+
+def test_halts_and_other_speeds_are_no_other_unit(tmp_path: Path) -> None:
+    position = np.arange(100) * 0.7
+    position[10:90] = position[10]
+    read_encoder(log(tmp_path, list(enumerate(position.tolist()))), 100, line_pitch_mm=0.5, repair=True)
+    steps = np.floor(np.arange(100) * 0.5 / 4) * 4  # a coarse counter
+    with pytest.raises(FileFormatError, match="not beyond the line before"):
+        read_encoder(log(tmp_path, list(enumerate(steps.tolist()))), 100, line_pitch_mm=0.5)
+
+
+@pytest.mark.parametrize("step", [1.0, 1.7, 4.0])
+def test_a_coarse_counter_does_not_halt(tmp_path: Path, step: float, caplog) -> None:
+    true = np.cumsum(0.5 + 0.1 * np.sin(np.arange(400) / 30))
+    file = log(tmp_path, list(enumerate((np.round(true / step) * step).tolist())))
+    with pytest.raises(FileFormatError, match="not beyond the line before"):
+        read_encoder(file, 400, line_pitch_mm=0.5)
+    repaired = read_encoder(file, 400, line_pitch_mm=0.5, repair=True).numpy()
+    assert f"multiples of {step:g} mm" in caplog.text
+    assert np.abs(repaired - true).max() < 0.6 * step
+    assert np.abs(repaired - true)[20:-20].max() < 0.3 * step
+    advance = np.diff(repaired)
+    assert advance.min() > 0.2
+    assert advance.max() < 1.0
+
+
+def test_a_coarse_counter_that_halts(tmp_path: Path) -> None:
+    true = np.arange(300) * 0.5
+    true[100:200] = true[100]
+    true[200:] = true[100] + 0.5 * np.arange(1, 101)
+    file = log(tmp_path, list(enumerate((np.round(true / 2) * 2).tolist())))
+    repaired = read_encoder(file, 300, line_pitch_mm=0.5, repair=True).numpy()
+    assert (np.diff(repaired) > 0).all()
+    moving = np.r_[0:100, 200:300]
+    assert np.abs(repaired - true)[moving].max() < 2.0
+    assert (np.diff(repaired)[110:190] < 1e-3).sum() >= 75  # nothing is taken from the halt
+
+
+@pytest.mark.parametrize("at", [3, 99])
+def test_a_jump_is_refused_and_repaired_only_between_good_readings(tmp_path: Path, at: int) -> None:
+    position = np.arange(100) * 0.5
+    file = log(tmp_path, [(line, place + 40_000 * (line == at)) for line, place in enumerate(position.tolist())])
+    with pytest.raises(FileFormatError, match=f"line {at} more than 1000 times the usual advance beyond the line"):
+        read_encoder(file, 100)
+    if at == 99:
+        with pytest.raises(FileFormatError, match="the first or the last line has no good reading"):
+            read_encoder(file, 100, repair=True)
+    else:
+        assert read_encoder(file, 100, repair=True).tolist() == position.tolist()
+
+
+@pytest.mark.parametrize(
     ("text", "message"),
     [
         ("0,1\n1,2\n", "expected the header line,position_mm"),

@@ -10,6 +10,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from lsvision.errors import FileFormatError
+from lsvision.geometry import zero_disparity_mm
 from lsvision.io import read_scan, write_line_image, write_rig
 from lsvision.types import DepthView, Rig, Travel
 
@@ -34,7 +35,8 @@ def test_round_trip(make_scan: MakeScan, small_rig: Rig, images) -> None:
 
 def test_everything_optional(make_scan: MakeScan, small_rig: Rig) -> None:
     positions = torch.rand(300, dtype=torch.float64).cumsum(0)
-    depth = torch.randn(300, 32, 1).masked_fill(torch.rand(300, 32, 1) < 0.1, torch.nan)
+    depth = zero_disparity_mm(small_rig) + torch.randn(300, 32, 1)
+    depth = depth.masked_fill(torch.rand(300, 32, 1) < 0.1, torch.nan)
     folder = make_scan(
         travel=Travel(0.56, positions, "reverse"),
         right=None,
@@ -82,6 +84,48 @@ def test_encoder_is_repaired_only_if_asked(make_scan: MakeScan) -> None:
     with pytest.raises(FileFormatError, match=r"encoder.csv: line 7 not beyond the line before"):
         read_scan(folder)
     assert read_scan(folder, repair_encoder=True).travel.positions_mm[7] == 7.0
+
+
+def depth_map(rig: Rig) -> torch.Tensor:
+    return zero_disparity_mm(rig) + torch.rand(300, 32, 1)
+
+
+@pytest.mark.parametrize("code", [0.0, -9999.0, math.inf, -math.inf, 1e6])
+def test_depth_that_the_rig_cannot_see_was_not_measured(make_scan: MakeScan, small_rig: Rig, code: float) -> None:
+    depth = depth_map(small_rig)
+    depth[:, 5:] = code  # most of the map
+    read = read_scan(make_scan(right=None, depth=[depth])).images.depth.read(10, 20)
+    assert torch.equal(read[:, :5], depth[10:20, :5])
+    assert read[:, 5:].isnan().all()
+
+
+def test_a_scan_of_which_nothing_was_measured_can_be_read(make_scan: MakeScan) -> None:
+    for code in (math.nan, 0.0, -1.0):
+        scan = read_scan(make_scan(right=None, depth=[torch.full((300, 32, 1), code)]))
+        assert scan.images.depth.read(0, 300).isnan().all()
+
+
+@pytest.mark.parametrize(
+    ("factor", "offset", "message"),
+    [
+        (1e-3, 0.0, "median 22.1 where the rig sees 22143 mm: expected depth in mm, these look like metres"),
+        (0.1, 0.0, "these look like centimetres"),
+        (1e3, 0.0, "these look like micrometres"),
+        (1.0, -22143.0, "these look like heights"),
+        (1.0, -22140.0, "these look like heights"),
+        (1.0, -22000.0, "these look like heights"),
+        (300.0, 0.0, "these are no depths of this rig"),
+    ],
+)
+@pytest.mark.parametrize("code", [math.nan, 0.0, -9999.0])
+def test_depth_in_another_unit_is_refused(
+    make_scan: MakeScan, small_rig: Rig, factor: float, offset: float, message: str, code: float
+) -> None:
+    depth = factor * (depth_map(small_rig) + offset)
+    depth[torch.rand(depth.shape) < 0.3] = code
+    folder = make_scan(right=None, depth=[depth])
+    with pytest.raises(FileFormatError, match=rf"scan\.yaml: depth: median .*{message.split('median ')[-1]}"):
+        read_scan(folder)
 
 
 @pytest.mark.parametrize(

@@ -75,6 +75,27 @@ def test_folder_of_frames_in_natural_order(tmp_path: Path, suffix: str) -> None:
     assert_reads(tmp_path, COLOR)
 
 
+@pytest.mark.parametrize(
+    "names",
+    [
+        ["7.png", "8.png", "9.png", "10.png"],
+        ["f_0.png", "f_300.png", "f_600.png"],  # by their first lines
+        ["0311T1200_f01.PNG", "0311T1207_f02.png", "0312T0001_f03.png"],
+        ["cam2_1.png", "cam2_2.png"],
+    ],
+)
+def test_frames_that_are_numbered_without_a_gap(tmp_path: Path, names: list[str]) -> None:
+    frames(*names)(tmp_path / "image")
+    assert open_line_image(tmp_path / "image").shape == (300 * len(names), 48, 3)
+
+
+def test_a_float_map_has_no_chunks_where_nothing_was_measured(tmp_path: Path) -> None:
+    array = zarr.create_array(tmp_path / "a", shape=(300, 48), chunks=(100, 48), dtype="f4", fill_value=np.nan)
+    array[:100] = 800.0
+    image = open_line_image(tmp_path / "a")
+    assert image.read(100, 300).isnan().all()
+
+
 def test_mono_frames_of_16_bit(tmp_path: Path) -> None:
     (tmp_path / "a.png").write_bytes(imagecodecs.png_encode(MONO16))
     assert_reads(tmp_path, MONO16)
@@ -175,6 +196,26 @@ def frames_of_two_widths(file: Path) -> None:
     (file / "2.png").write_bytes(imagecodecs.png_encode(COLOR[:, 1:].copy()))
 
 
+def frames(*names: str) -> Callable[[Path], None]:
+    """Makes a folder of equal frames; those that end in .jpg are not read."""
+
+    def make(file: Path) -> None:
+        file.mkdir()
+        for name in names:
+            (file / name).write_bytes(imagecodecs.png_encode(COLOR))
+
+    return make
+
+
+def zarr_without_a_chunk(file: Path) -> None:
+    zarr.create_array(file, data=COLOR, chunks=(100, 48, 3), zarr_format=2)
+    (file / "1.0.0").unlink()
+
+
+def turned(file: Path) -> None:
+    tifffile.imwrite(file, COLOR, photometric="rgb", extratags=[(274, "H", 1, 3, True)])
+
+
 def frame_that_is_text(file: Path) -> None:
     file.mkdir()
     (file / "1.png").write_text("no image")
@@ -194,6 +235,16 @@ def frame_that_is_text(file: Path) -> None:
         (zarr_group, "not a readable Zarr array"),
         (zarr_of_four_dimensions, "expected an array"),
         (frames_of_two_widths, "2.png: expected 48 columns as 1.png has, got 47"),
+        (frames("f_1.png", "f_2.png", "f_4.png", "f_9.png"), r"frames 3, 5-8 are missing \(f_1.png to f_9.png\)"),
+        (frames("f_1.png", "f_3.png"), "frames 2 are missing"),
+        (frames("f_1.png", "f_01.png", "f_2.png"), "frames with equal numbers"),
+        (frames("f_1.png", "f_2.jpg", "f_3.png"), "f_2.jpg: expected frames of one kind only, as f_1.png is"),
+        (frames("f_1.png", "f_2.png", "f_3.bmp"), "expected frames of one kind only"),
+        (frames("f_1.png", "F_2.png"), "expected frames whose names differ in a number only"),
+        (frames("a.png", "b.png"), "expected frames whose names differ in a number only"),
+        (frames("f_0.5.png", "f_1.0.png", "f_1.5.png"), "expected frames that are numbered one by one"),
+        (zarr_without_a_chunk, "1 of 3 chunks are missing"),
+        (turned, "expected the first line at the top .* got orientation 3"),
         (frame_that_is_text, "1.png: expected a PNG, BMP or TIFF"),
         (lambda file: None, "no such image"),
     ],

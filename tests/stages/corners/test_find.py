@@ -102,6 +102,18 @@ def test_depth_maps_agree_with_two_images():
     assert (torch.linalg.eigvalsh(mapped.covariance) > 0).all()
 
 
+def test_covariance_of_an_exact_depth_map_covers_the_error_of_the_corner():
+    source = simulation()
+    corners = find_corners(depth_scan(source), BOARD)
+    error = corners.points - true_measurement(source)
+    ratio = rms(error) / corners.covariance.diagonal(dim1=-2, dim2=-1).mean(0).sqrt()
+    assert (ratio < 2).all()
+    assert (ratio > 0.5).all()
+    # Three coordinates of two measured ones: the rest of the covariance is that of the map's numbers.
+    squared = (error * torch.linalg.solve(corners.covariance, error[..., None])[..., 0]).sum(-1)
+    assert 1.0 < squared.mean() < 6.0
+
+
 def test_no_board_names_the_scan():
     source = simulation()
     scan = stereo_scan(source)
