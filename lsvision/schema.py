@@ -8,6 +8,7 @@ a number, 3.0 is no whole number. A list stands for a tuple, an unknown key is a
 
 import difflib
 from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
 from dataclasses import MISSING, Field, asdict, dataclass, fields, is_dataclass
 from functools import cache
 from types import NoneType, UnionType
@@ -155,10 +156,10 @@ def check(annotation: Any, value: object, key: str, fault: Fault) -> Any:
         converted = shape.kind(check(shape.item(i), item, f"{key}[{i}]", fault) for i, item in enumerate(value))
     elif shape.kind is dict and isinstance(value, Mapping):
         converted = {name: check(shape.arguments[1], item, f"{key}.{name}", fault) for name, item in value.items()}
-    try:
+    # Raised outside of the handler: an error that keeps pydantic's as its context cannot travel between processes.
+    with suppress(ValidationError):
         return _adapter(annotation).validate_python(converted)
-    except ValidationError:
-        raise fault(key, f"expected {in_words(annotation)}, got {shown(value)}") from None
+    raise fault(key, f"expected {in_words(annotation)}, got {shown(value)}")
 
 
 def build(schema: type[T], data: object, fault: Fault, where: str = "") -> T:

@@ -5,6 +5,7 @@ from dataclasses import dataclass, field, replace
 from typing import Annotated, Literal
 
 import pytest
+from pydantic import ValidationError
 
 from lsvision.errors import ConfigError
 from lsvision.schema import (
@@ -120,6 +121,7 @@ def test_errors_are_those_of_the_caller() -> None:
 def test_a_dataclass_made_in_python_holds_to_the_same_ranges(make: Callable, message: str) -> None:
     with pytest.raises(ConfigError, match=message) as raised:
         make()
+    assert not isinstance(raised.value.__context__, ValidationError)  # which cannot be unpickled
     again = pickle.loads(pickle.dumps(raised.value))
     assert isinstance(again, OptionError)
     assert str(again) == str(raised.value)
