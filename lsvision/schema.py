@@ -143,8 +143,7 @@ def check(annotation: Any, value: object, key: str, fault: Fault) -> Any:
 
     Args:
         annotation: a scalar type, a dataclass, or lists, tuples and dictionaries of them, any of them ``Annotated``.
-        key: where the value stands ("correction.strip_rows").
-        fault: makes the error.
+        key: where the value stands ("correction.strip_rows"). fault: makes the error.
     """
     shape = shape_of(annotation)
     if value is None and shape.optional:
@@ -168,8 +167,7 @@ def build(schema: type[T], data: object, fault: Fault, where: str = "") -> T:
     Args:
         schema: the dataclass; fields without a default are required. Metadata of a field may give it another ``key``.
         data: what was read; anything but a mapping is an error.
-        fault: makes the error from the key and the problem.
-        where: key of the mapping itself ("motion"); empty for the whole.
+        fault: makes the error. where: key of the mapping itself ("motion"); empty for the whole.
     """
     if not isinstance(data, Mapping):
         raise fault(where, f"expected keys with values, got {shown(data)}")
