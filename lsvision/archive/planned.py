@@ -82,7 +82,7 @@ def plan_scan(found: Found, calibrations: Sequence[DatedCalibration], processing
     grid = plan_product(scan, calibration.calibration.motion, processing.correction)
     return PlannedScan(
         key=found.key,
-        files=ScanFiles(str(found.path), stamp, processing.repair_encoder),
+        files=ScanFiles(str(found.path), stamp, scan.lines, processing.repair_encoder),
         lines=scan.lines,
         width=scan.rig.width_px,
         matched=isinstance(scan.images, StereoPair),
