@@ -26,6 +26,7 @@ from lsvision.archive.work import (
 )
 from lsvision.errors import NothingMeasuredError
 from lsvision.io import create_product, naming_full_disk
+from lsvision.stages.correction.uncertainty import drift_per_metre
 
 WORK_FOLDER = ".work"
 
@@ -56,6 +57,8 @@ class ScanJob:
     def __init__(self, planned: PlannedScan, place: Place) -> None:
         self.planned, self._place = planned, place
         known = place.ledger.scan(planned.key)
+        calibration = planned.calibration.calibration
+        sideways, in_depth = calibration.motion.drift_mm_per_m
         untouched = known is not None and known.stamp == planned.files.stamp
         place.ledger.put_scan(
             ScanRow(
@@ -69,6 +72,10 @@ class ScanJob:
                 calibration_sha256=planned.calibration.sha256,
                 config_sha256=place.processing.sha256,
                 version=__version__,
+                verdict=calibration.verdict,
+                sideways_mm_per_m=sideways,
+                in_depth_mm_per_m=in_depth,
+                drift_sigma_mm_per_m=max(drift_per_metre(calibration.motion)),
             )
         )
 
