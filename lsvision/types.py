@@ -404,7 +404,8 @@ class ProductStrip:
         color: in the scan's dtype.
         height: float32, mm towards the cameras from the middle of the plane of zero disparity, NaN where not measured.
         valid: where the height was measured.
-        source: float32 (line, column) of the scan that the colour came from, NaN where no line saw the cell.
+        source: (line, column) of the scan that the colour came from, NaN where no line saw the cell; float32, for long
+            scans float64.
         sigma: float32, mm, standard deviations of (q_x, q_y, q_z), where they were asked for.
     """
 

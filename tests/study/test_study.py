@@ -199,6 +199,14 @@ def test_wrong_conditions_are_named(rig):
         noise_chol(dataclasses.replace(POINT, depth_sigma_mm=0.0))
 
 
+def test_study_of_a_vibration_shows_by_wavelength_whether_sigma_covers_it(command, tmp_path):
+    axes = ("axes.boards=null", "axes.vibration_wavelength_mm=[97.0,480.0]", "conditions.vibration_mm=0.1")
+    assert command("+experiment=study", *axes, "runs=2", "map_steps=2") == 0
+    points = polars.read_parquet(tmp_path / "run" / "points.parquet")
+    assert points["along_scan"].to_list() == [1.0, 1.0]
+    assert (tmp_path / "run" / "figures" / "coverage_vibration_wavelength_mm.svg").is_file()
+
+
 def test_command_writes_tables_and_report(command, tmp_path):
     axes = ("axes.boards=[one_tilted,two_tilted]", "axes.method=[joint,two_step]", "axes.angle_z_deg=[-1.0,1.0]")
     assert command("+experiment=study", *axes, "runs=4", "conditions.iterations=3", "map_steps=5") == 0

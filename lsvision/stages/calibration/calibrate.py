@@ -14,7 +14,7 @@ from lsvision.estimation import Info, Posterior
 from lsvision.stages.calibration.config import CalibrationConfig
 from lsvision.stages.calibration.correlated import ErrorsAlongScan
 from lsvision.stages.calibration.measurements import BoardMeasurements, SoundProblem
-from lsvision.stages.calibration.model import rotations, squared_residuals, translations
+from lsvision.stages.calibration.model import refitted, rotations, squared_residuals, translations
 from lsvision.stages.calibration.noise import board_chi_square
 from lsvision.stages.calibration.observability import observe
 from lsvision.stages.calibration.problem import BoardProblem, MountingPitch
@@ -145,7 +145,7 @@ class _Solution:
         singular = posterior.info == int(Info.SINGULAR)
         state = torch.where(singular[..., None], torch.nan, posterior.mean)
         path = torch.where(singular[..., None], torch.nan, posterior.path)
-        squared, corners = squared_residuals(problem, path), problem.valid.sum(-1)
+        squared, corners = self._squared_residuals(path), problem.valid.sum(-1)
         board_rmse = (squared / corners).sqrt()
         motion_factor = torch.where(singular[..., None, None], torch.nan, posterior.factor[..., -3:, :])
         return BatchCalibration(
@@ -164,6 +164,14 @@ class _Solution:
             converged=posterior.converged & ~singular,
             info=posterior.info,
         )
+
+    def _squared_residuals(self, path: Tensor) -> Tensor:
+        """Sums by iteration and board, mm²; errors along the scan are no fault of n, and poses take what they can."""
+        squared, found = squared_residuals(self.problem, path), self.along_scan.found
+        if bool(found.any()):
+            shaken = self.problem.at(found)
+            squared[:, found] = squared_residuals(shaken, refitted(shaken, path[:, found]))
+        return squared
 
 
 def _solve(measured: BoardMeasurements, config: CalibrationConfig) -> _Solution:

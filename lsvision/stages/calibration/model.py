@@ -19,7 +19,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lsvision.estimation import apply, product
-from lsvision.geometry import displace, scan_position, transform
+from lsvision.geometry import displace, fit_rigid, scan_position, transform, vector_from_rotation
 from lsvision.stages.calibration.problem import BoardProblem, BoardState
 
 
@@ -61,6 +61,14 @@ def squared_residuals(problem: BoardProblem, state: Float[Tensor, "*#batch state
     motion = torch.stack([eye[0].expand_as(n), n, eye[2].expand_as(n)], dim=-2)[..., None, :, :]
     coefficients = torch.cat([-parts.position[..., None, :], -rotation.mT, motion.expand_as(rotation)], dim=-2)
     return product(problem.residual_rows, coefficients).square().sum((-2, -1))
+
+
+def refitted(problem: BoardProblem, state: Float[Tensor, "*#batch state"]) -> Float[Tensor, "*batch state"]:
+    """The state of the same n and the poses that fit best under it, all corners weighed alike: those of least RMSE."""
+    n = BoardState.split(state).n
+    fitted = fit_rigid(problem.body_points, displace(problem.points, n[..., None, None, :]), problem.valid)
+    theta = vector_from_rotation(fitted.rotation @ problem.rotation.mT)
+    return BoardState(theta, fitted.translation, n).join()
 
 
 def rmse(problem: BoardProblem, state: Float[Tensor, "*#batch state"]) -> Float[Tensor, "*batch"]:
