@@ -10,12 +10,13 @@ from torch import Tensor
 
 from lsvision.errors import CalibrationError, ConfigError
 from lsvision.estimation import Info, Posterior
+from lsvision.geometry import sharp_depth_mm
 from lsvision.stages.calibration.config import CalibrationConfig
 from lsvision.stages.calibration.measurements import BoardMeasurements, SoundProblem
 from lsvision.stages.calibration.methods import estimate
 from lsvision.stages.calibration.model import rotations, squared_residuals, translations
-from lsvision.stages.calibration.noise import board_chi_square, noise_scale
-from lsvision.stages.calibration.observability import observe
+from lsvision.stages.calibration.noise import board_chi_square, drifting_noise_scale, noise_scale
+from lsvision.stages.calibration.observability import Known, observe
 from lsvision.stages.calibration.problem import BoardProblem, MountingPitch
 from lsvision.stages.calibration.verdict import judge, not_settled, rmse_grew
 from lsvision.types import BoardCorners, BoardFit, Calibration, Iteration, Motion, Pose, Rig
@@ -71,7 +72,9 @@ def calibrate(boards: Sequence[BoardCorners], rig: Rig, config: CalibrationConfi
         raise CalibrationError(
             f"{', '.join(board.scan for board in boards)}: the corners do not determine the boards' poses"
         )
-    observability = observe(solution.problem, solution.posterior.mean, config.prior_sigma, scale)
+    depth_mm = config.depth_range_mm or sharp_depth_mm(rig)
+    known = Known(batch.covariance, config.prior_sigma, scale, depth_mm)
+    observability = observe(solution.problem, solution.posterior.mean, known)
     iterations, converged = _iterations(batch), bool(batch.converged)
     contradictions = rmse_grew(iterations[0].rmse_mm, iterations[-1].rmse_mm)
     judged = judge(not_settled(converged, int(batch.iterations)), contradictions, observability)
@@ -81,7 +84,7 @@ def calibrate(boards: Sequence[BoardCorners], rig: Rig, config: CalibrationConfi
         rmse_before_mm=iterations[0].rmse_mm,
         rmse_after_mm=iterations[-1].rmse_mm,
         iterations=iterations,
-        boards=_board_fits(boards, batch, board_chi_square(solution.problem, solution.posterior)),
+        boards=_board_fits(boards, batch, board_chi_square(solution.problem, solution.posterior.mean)),
         observability=observability,
         rig=rig,
         verdict=judged.verdict,
@@ -153,8 +156,12 @@ def _solve(measured: BoardMeasurements, config: CalibrationConfig) -> _Solution:
     posed = SoundProblem.of(measured, _mounting_pitch(config))
     problem, start = posed.problem, posed.start
     posterior = estimate(problem, start, config)
-    drifting = config.method == "sequential" and bool(config.process_sigma)  # residuals of one n are then no noise
-    scale = torch.ones_like(start[..., 0]) if drifting else noise_scale(problem, posterior)
+    drifting = config.method == "sequential" and bool(config.process_sigma)
+    scale = (
+        drifting_noise_scale(problem, start, posterior.mean, config)
+        if drifting
+        else noise_scale(problem, posterior.mean)
+    )
     if bool((scale > 1).any()):
         noisier = replace(problem, noise_chol=problem.noise_chol * scale.sqrt()[..., None, None, None, None])
         posterior = _merge(scale > 1, estimate(noisier, start, config), posterior)

@@ -4,7 +4,7 @@ The state is x = [θ_1, t_1, .., θ_B, t_B, n]: for each board a rotation vector
 the position of its corners' centroid, then the motion n. ``model`` relates it to the corners.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import torch
@@ -66,6 +66,14 @@ class BoardProblem:
     def rotation_at(self, theta: Float[Tensor, "*#batch boards 3"]) -> Float[Tensor, "*batch boards 3 3"]:
         """Rotations exp(θ) R0 of the boards."""
         return rotation_from_vector(theta) @ self.rotation
+
+    def chosen(self, mask: Bool[Tensor, "*batch"]) -> "BoardProblem":
+        """The problems of a batch where ``mask`` is true, in one leading dimension."""
+        names = ("points", "noise_chol", "body_points", "centroid", "valid", "rotation")
+        problem = replace(self, **{name: getattr(self, name)[mask] for name in names})
+        if "affine_rows" in self.__dict__:  # the dear one is not computed again
+            problem.__dict__["affine_rows"] = self.affine_rows[mask]
+        return problem
 
     @cached_property
     def affine_rows(self) -> Float[Tensor, "*batch boards 13 13"]:
