@@ -90,9 +90,10 @@ def _motion_headlines(calibration: Calibration) -> list[Headline]:
 
 
 def _explained(calibration: Calibration) -> list[str]:
-    """The reasons for the verdict, and the advice where it is not one of them."""
+    """The reasons for the verdict, the errors that it allows for, and the advice where it is not one of them."""
     advice = calibration.observability.advice
-    return [*calibration.reasons, *([] if advice in calibration.reasons else [advice])]
+    allowed_for = [error.in_words for error in calibration.errors_along_scan]
+    return [*calibration.reasons, *allowed_for, *([] if advice in calibration.reasons else [advice])]
 
 
 def product_report(

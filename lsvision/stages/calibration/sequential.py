@@ -18,7 +18,7 @@ from lsvision.estimation import (
     nees,
 )  # fmt: skip
 from lsvision.stages.calibration.config import CalibrationConfig
-from lsvision.stages.calibration.joint import covering, mode_of, widened_where_open
+from lsvision.stages.calibration.joint import covering, joint, mode_of, widened_where_open
 from lsvision.stages.calibration.linearise import corner_rows, point_factor
 from lsvision.stages.calibration.prior import prior_about
 from lsvision.stages.calibration.problem import BoardProblem
@@ -32,9 +32,12 @@ def sequential(problem: BoardProblem, start: Float[Tensor, "*batch state"], conf
 
     The result is n at the end of the last scan. The passes begin at the mode of an n that stands still. Each filters
     from the same prior with the corners linearised about the pass before: the boards' poses do not move, so that their
-    last state is their smoothed one. Where a linearisation does not hold, the covariance is the second moment of an n
+    last state is their smoothed one. Corners that err together are no sequence of measurements: they are taken at once,
+    and n stands still. Where a linearisation does not hold, the covariance is the second moment of an n
     that stands still, and the random walk's.
     """
+    if problem.correlated is not None:
+        return joint(problem, start, config)
     prior = prior_about(start, config)
     mode = mode_of(problem, prior, start, config)
     mean, path = torch.where(mode.converged[..., None], mode.state, start), [start]
