@@ -58,7 +58,8 @@ def errors_along_scan(
     """The errors along the scan for which residuals give evidence.
 
     Problems are looked at one by one, and only where a quick test of the residuals is suspicious: so no bit of one
-    depends on the others, and sound corners cost next to nothing.
+    depends on the others, and sound corners cost next to nothing. Residuals of a result that has not converged say
+    nothing of the corners.
 
     Args:
         posterior, noise_scale: of the problems with white noise alone.
@@ -69,7 +70,7 @@ def errors_along_scan(
     rms, length = (torch.zeros_like(posterior.mean[..., :3]) for _ in range(2))
     found = torch.zeros_like(posterior.converged)
     if not math.isinf(odds):
-        found = suspicious(problem, posterior.mean, noise_scale) & torch.isfinite(posterior.factor).all((-2, -1))
+        found = suspicious(problem, posterior.mean, noise_scale) & posterior.converged
     if not bool(found.any()):
         return ErrorsAlongScan(found, rms, length, None)
     rows, log_det = problem.affine_rows.clone(), problem.noise_log_det.clone()

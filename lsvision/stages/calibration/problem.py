@@ -69,7 +69,10 @@ class BoardProblem:
         """One problem of a batch by its indices, or those of a mask in a row."""
         names = ("points", "noise_chol", "body_points", "centroid", "valid", "rotation")
         correlated = None if self.correlated is None else self.correlated.at(place)
-        return replace(self, correlated=correlated, **{name: getattr(self, name)[place] for name in names})
+        problem = replace(self, correlated=correlated, **{name: getattr(self, name)[place] for name in names})
+        if "affine_rows" in self.__dict__:  # the dear one is not computed again
+            problem.__dict__["affine_rows"] = self.affine_rows[place]
+        return problem
 
     def scaled(self, noise_scale: Float[Tensor, "*batch"]) -> "BoardProblem":
         """The problem with the covariance of the corners' noise multiplied by a factor."""

@@ -2,15 +2,15 @@
 
 from dataclasses import dataclass
 
-import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from lsvision.estimation import Posterior
+from lsvision.stages.calibration.chosen import merged, scattered
 from lsvision.stages.calibration.config import CalibrationConfig
 from lsvision.stages.calibration.correlated import ErrorsAlongScan, errors_along_scan
 from lsvision.stages.calibration.methods import estimate
-from lsvision.stages.calibration.noise import noise_scale
+from lsvision.stages.calibration.noise import drifting_noise_scale, noise_scale
 from lsvision.stages.calibration.problem import BoardProblem
 
 
@@ -23,8 +23,8 @@ class Estimate:
 
     def replaced(self, chosen: Bool[Tensor, "*batch"], part: "Estimate") -> "Estimate":
         """The same with the chosen problems' replaced by those of ``part``, in a row."""
-        scale = _scattered(chosen, part.noise_scale, self.noise_scale)
-        return Estimate(_merged(chosen, part.posterior, self.posterior), scale)
+        scale = scattered(chosen, part.noise_scale, self.noise_scale)
+        return Estimate(merged(chosen, part.posterior, self.posterior), scale)
 
 
 @dataclass(frozen=True)
@@ -48,27 +48,12 @@ def estimate_with_noise(
 def estimate_white(problem: BoardProblem, start: Float[Tensor, "*batch state"], config: CalibrationConfig) -> Estimate:
     """Posteriors with the noise as the problem has it, or scaled up where the residuals ask for it."""
     posterior = estimate(problem, start, config)
-    drifting = config.method == "sequential" and bool(config.process_sigma)  # residuals of one n are then no noise
-    one = torch.ones_like(start[..., 0])
-    found = Estimate(posterior, one if drifting else noise_scale(problem, posterior))
+    if config.method == "sequential" and config.process_sigma and problem.correlated is None:
+        found = Estimate(posterior, drifting_noise_scale(problem, start, posterior.mean, config))
+    else:
+        found = Estimate(posterior, noise_scale(problem, posterior.mean))
     larger = found.noise_scale > 1
     if not bool(larger.any()):
         return found
     again = estimate(problem.scaled(found.noise_scale).at(larger), start[larger], config)
     return found.replaced(larger, Estimate(again, found.noise_scale[larger]))
-
-
-def _merged(chosen: Tensor, part: Posterior, whole: Posterior) -> Posterior:
-    length = max(len(part.path), len(whole.path))
-    paths = (torch.cat([p.path, p.path[-1:].expand(length - len(p.path), *p.path.shape[1:])]) for p in (part, whole))
-    path = [_scattered(chosen, *steps) for steps in zip(*paths, strict=True)]
-    names = ("mean", "factor", "iterations", "converged", "info")
-    merged = {name: _scattered(chosen, getattr(part, name), getattr(whole, name)) for name in names}
-    return Posterior(path=torch.stack(path), **merged)
-
-
-def _scattered(chosen: Tensor, part: Tensor, whole: Tensor) -> Tensor:
-    """A copy with the entries of a mask replaced by those of ``part``, in order."""
-    copy = whole.clone()
-    copy[chosen] = part
-    return copy
