@@ -132,13 +132,15 @@ def points_truth(runs):
     return runs["n3"] - runs["error_n3"]
 
 
-def test_two_steps_contract_slowly_and_the_joint_update_at_once(rig):
+def test_two_steps_contract_to_a_third_and_the_joint_update_at_once(rig):
+    """Of the RMSE, down to what the error of n3 leaves: several boards show it, and two steps hardly approach it."""
     points = [dataclasses.replace(POINT, method=method, iterations=8) for method in ("joint", "two_step")]
     _, table, iterations = table_of(rig, points, runs=4)
     joint, two_step = (iterations.filter(polars.col("point") == i)["median"].to_list() for i in (0, 1))
     assert joint[2] < 0.05
     ratios = [after / before for before, after in itertools.pairwise(two_step)]
-    assert all(0.8 < ratio < 1.0 for ratio in ratios)
+    assert all(0.3 < ratio < 0.5 for ratio in ratios[:2])
+    assert all(0.9 < ratio < 1.0 for ratio in ratios[-3:])
     assert table["converged"].to_list() == [1.0, 0.0]
 
 

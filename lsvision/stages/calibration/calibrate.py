@@ -11,12 +11,13 @@ from torch import Tensor
 
 from lsvision.errors import CalibrationError, ConfigError
 from lsvision.estimation import Info, Posterior
+from lsvision.geometry import sharp_depth_mm
 from lsvision.stages.calibration.config import CalibrationConfig
 from lsvision.stages.calibration.correlated import ErrorsAlongScan
 from lsvision.stages.calibration.measurements import BoardMeasurements, SoundProblem
 from lsvision.stages.calibration.model import refitted, rotations, squared_residuals, translations
 from lsvision.stages.calibration.noise import board_chi_square
-from lsvision.stages.calibration.observability import observe
+from lsvision.stages.calibration.observability import Known, observe
 from lsvision.stages.calibration.problem import BoardProblem, MountingPitch
 from lsvision.stages.calibration.solution import estimate_with_noise
 from lsvision.stages.calibration.verdict import judge, not_settled, rmse_grew
@@ -79,7 +80,9 @@ def calibrate(boards: Sequence[BoardCorners], rig: Rig, config: CalibrationConfi
         raise CalibrationError(
             f"{', '.join(board.scan for board in boards)}: the corners do not determine the boards' poses"
         )
-    observability = observe(solution.weighed, solution.posterior.mean, config.prior_sigma, scale)
+    depth_mm = config.depth_range_mm or sharp_depth_mm(rig)
+    known = Known(batch.covariance, config.prior_sigma, scale, depth_mm)
+    observability = observe(solution.weighed, solution.posterior.mean, known)
     iterations, converged = _iterations(batch), bool(batch.converged)
     contradictions = rmse_grew(iterations[0].rmse_mm, iterations[-1].rmse_mm)
     judged = judge(not_settled(converged, int(batch.iterations)), contradictions, observability)
@@ -89,7 +92,7 @@ def calibrate(boards: Sequence[BoardCorners], rig: Rig, config: CalibrationConfi
         rmse_before_mm=iterations[0].rmse_mm,
         rmse_after_mm=iterations[-1].rmse_mm,
         iterations=iterations,
-        boards=_board_fits(boards, batch, board_chi_square(solution.problem, solution.posterior)),
+        boards=_board_fits(boards, batch, board_chi_square(solution.problem, solution.posterior.mean)),
         observability=observability,
         rig=rig,
         verdict=judged.verdict,
@@ -169,7 +172,7 @@ class _Solution:
         """Sums by iteration and board, mm²; errors along the scan are no fault of n, and poses take what they can."""
         squared, found = squared_residuals(self.problem, path), self.along_scan.found
         if bool(found.any()):
-            shaken = self.problem.at(found)
+            shaken = self.problem.chosen(found)
             squared[:, found] = squared_residuals(shaken, refitted(shaken, path[:, found]))
         return squared
 
