@@ -16,11 +16,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from lsvision.estimation import Posterior
 from lsvision.estimation.gaussian_process import covariance_root
 from lsvision.stages.calibration.evidence import NormalEquations, Travel
 from lsvision.stages.calibration.kernels import AMPLITUDES, KNOTS, KernelFamily, kernel_family, wave_length
-from lsvision.stages.calibration.model import whitened_residuals
 from lsvision.stages.calibration.problem import BoardProblem
 from lsvision.stages.calibration.reduction import CorrelatedNoise, rows_with_latents
 
@@ -52,59 +50,69 @@ class ErrorsAlongScan:
         return replace(problem, correlated=self.noise).at(self.found)
 
 
+@dataclass(frozen=True)
+class Beforehand:
+    """What is known before the search.
+
+    Attributes:
+        prior_sigma: of each component of n.
+        process_sigma: of the random walk of n per square root of a mm; what it explains is no error along the scan.
+        odds: how many times more probable than white noise alone errors along the scan must make the corners. Sound
+            corners do so with a probability of at most one in ``odds`` (Markov's inequality).
+    """
+
+    prior_sigma: float
+    process_sigma: float
+    odds: float
+
+
 def errors_along_scan(
-    problem: BoardProblem, posterior: Posterior, noise_scale: Float[Tensor, "*batch"], prior_sigma: float, odds: float
+    problem: BoardProblem, state: Float[Tensor, "*batch state"], doubtful: Bool[Tensor, "*batch"], known: Beforehand
 ) -> ErrorsAlongScan:
     """The errors along the scan for which residuals give evidence.
 
-    Problems are looked at one by one, and only where a quick test of the residuals is suspicious: so no bit of one
-    depends on the others, and sound corners cost next to nothing. Residuals of a result that has not converged say
-    nothing of the corners.
+    Problems are looked at one by one, so that no bit of one depends on the others, and the doubtful ones alone, as each
+    takes a tenth of a second.
 
     Args:
-        posterior, noise_scale: of the problems with white noise alone.
-        prior_sigma: of each component of n.
-        odds: how many times more probable than white noise alone they must make the corners. Sound corners do so with
-            a probability of at most one in ``odds`` (Markov's inequality).
+        state: of the problems with white noise.
+        doubtful: see ``suspicious``.
     """
-    rms, length = (torch.zeros_like(posterior.mean[..., :3]) for _ in range(2))
-    found = torch.zeros_like(posterior.converged)
-    if not math.isinf(odds):
-        found = suspicious(problem, posterior.mean, noise_scale) & posterior.converged
+    rms, length = (torch.zeros_like(state[..., :3]) for _ in range(2))
+    found = doubtful.clone()
     if not bool(found.any()):
         return ErrorsAlongScan(found, rms, length, None)
     rows, log_det = problem.affine_rows.clone(), problem.noise_log_det.clone()
-    for index in found.nonzero():
+    for index in doubtful.nonzero():
         place = tuple(index.tolist())
         one = problem.at(place)
-        covariance = _Search.of(one, posterior.mean[place], prior_sigma).covariance(math.log(odds))
+        search = _Search.of(one, state[place], known)
+        covariance = search.covariance(math.log(known.odds))
         if covariance is None:
             found[place] = False
             continue
         rms[place] = covariance.diagonal(dim1=-2, dim2=-1).mean(-1).sqrt()
         length[place] = wave_length(covariance) * Travel.of(one).extent_mm
-        noise = with_processes(one, covariance_root(covariance))
+        noise = with_processes(one, covariance_root(covariance + search.walk))
         rows[place], log_det[place] = noise.rows, noise.log_det
     return ErrorsAlongScan(found, rms, length, CorrelatedNoise(rows, log_det) if bool(found.any()) else None)
 
 
-def suspicious(
-    problem: BoardProblem, state: Float[Tensor, "*batch state"], noise_scale: Float[Tensor, "*batch"]
-) -> Bool[Tensor, "*batch"]:
-    """Whether residuals at a state are correlated along the travel more than chance allows.
+def suspicious(problem: BoardProblem, whitened: Float[Tensor, "*batch boards corners 3"]) -> Bool[Tensor, "*batch"]:
+    """Whether residuals are correlated along the travel more than chance allows.
 
     They are projected on half-waves over each board's travel. Of white residuals the squares, over all boards, are
     chi-square variables, and what the fit of poses and n takes makes them smaller.
+
+    Args:
+        whitened: residuals of the corners in sigmas, zero where ``valid`` is false.
     """
-    corners = problem.points.shape[-2]
-    residual = whitened_residuals(problem, state)[..., : problem.boards * corners * 3]
-    residual = residual.unflatten(-1, (problem.boards, corners, 3)) / noise_scale.sqrt()[..., None, None, None]
     travel = Travel.of(problem)
     place = (problem.points[..., 1] - travel.start_mm[..., None]) / travel.extent_mm[..., None, None]
     by_order = []
     for order in range(_ORDERS + 1):
         wave = torch.where(problem.valid, torch.cos(math.pi * order * place), 0.0)
-        squares = (wave[..., None] * residual).sum(-2).square()
+        squares = (wave[..., None] * whitened).sum(-2).square()
         by_order.append((squares / wave.square().sum(-1).clamp(min=1.0)[..., None]).sum(-2))
     squares = torch.stack(by_order, dim=-1)
     freedom = torch.tensor(problem.boards / 2, dtype=squares.dtype, device=squares.device)
@@ -114,16 +122,16 @@ def suspicious(
     return tests.amin(-1) * tests.shape[-1] < _SUSPICION
 
 
-def with_processes(problem: BoardProblem, roots: Float[Tensor, "3 knots columns"]) -> CorrelatedNoise:
-    """The noise of a problem's corners and of a process per component, given by its root at the knots, mm.
+def with_processes(problem: BoardProblem, roots: Float[Tensor, "_ 3 knots columns"]) -> CorrelatedNoise:
+    """The noise of a problem's corners and of a process per board and component, given by its root at the knots, mm.
 
     Args:
         problem: of batch shape ().
     """
-    at_corners = Travel.of(problem).weights(problem) @ roots[:, None]
+    at_corners = Travel.of(problem).weights(problem)[:, None] @ roots
     latents = torch.zeros(*problem.points.shape, 3, roots.shape[-1], dtype=roots.dtype, device=roots.device)
     for component in range(3):
-        latents[..., component, component, :] = at_corners[component]
+        latents[..., component, component, :] = at_corners[:, component]
     noise = rows_with_latents(
         problem.noise_chol, problem.points, problem.body_points, problem.valid, latents.flatten(-2)
     )
@@ -142,18 +150,23 @@ class _Search:
     covariances: Float[Tensor, "3 processes knots knots"]
     by_kernel: Float[Tensor, "3 kernels"]  # log likelihood ratio to no error; that there is none has its part in it
     kept: Bool[Tensor, "3 kernels"]
+    walk: Float[Tensor, "_ 1 knots knots"]  # covariance of what a walk of n explains, by board
 
     @classmethod
-    def of(cls, problem: BoardProblem, state: Tensor, prior_sigma: float) -> "_Search":
+    def of(cls, problem: BoardProblem, state: Tensor, known: Beforehand) -> "_Search":
         """A search in one problem that has found nothing yet."""
         family = kernel_family().to(state)
         kernels = len(family.log_prior)
+        walk = state.new_zeros(1, 1, KNOTS, KNOTS)
+        if known.process_sigma:
+            walk = Travel.of(problem).walk(known.process_sigma)[:, None]
         return cls(
-            equations=NormalEquations.of(problem, state, prior_sigma),
+            equations=NormalEquations.of(problem, state, known.prior_sigma),
             family=family,
             covariances=state.new_zeros(3, _PROCESSES, KNOTS, KNOTS),
             by_kernel=state.new_zeros(3, kernels),
             kept=torch.ones(3, kernels, dtype=torch.bool, device=state.device),
+            walk=walk,
         )
 
     def covariance(self, log_odds: float) -> Tensor | None:
@@ -196,7 +209,7 @@ class _Search:
         others = [other for other in range(3) if other != component]
         own = [other for other in range(_PROCESSES) if other != layer]
         standing = [*self.covariances[others].sum(1), self.covariances[component, own].sum(0)]
-        roots = covariance_root(torch.stack(standing))[None]
+        roots = covariance_root(torch.stack(standing) + self.walk)
         index = torch.tensor([*others, component], device=roots.device)
         given = self.equations.given(component, index, roots)
         return self.equations.log_ratios(given, family, self._variances(component))

@@ -146,6 +146,17 @@ class Travel:
         end = torch.where(problem.valid, travel, -torch.inf).amax(-1)
         return cls(start, (end - start).amax(-1).clamp(min=1e-9))
 
+    def walk(self, process_sigma: float) -> Float[Tensor, "*batch boards knots knots"]:
+        """Covariance at the knots, mm², of what each component is displaced by where n walks at random along the scan.
+
+        It is counted from the end of each board, where n is asked for; ``process_sigma`` is per square root of a mm.
+        """
+        place = (torch.arange(KNOTS, dtype=self.start_mm.dtype, device=self.start_mm.device) - 1.0) / INTERVALS
+        travel = self.start_mm[..., None] + self.extent_mm[..., None, None] * place
+        left = self.extent_mm[..., None, None] * (1.0 - place).clamp(min=0.0)
+        by_n = torch.minimum(left[..., :, None], left[..., None, :])
+        return process_sigma**2 * travel[..., :, None] * travel[..., None, :] * by_n
+
     def weights(self, problem: BoardProblem) -> Float[Tensor, "*batch boards corners knots"]:
         """Weights of the knots at each corner, zero where ``valid`` is false."""
         place = (problem.points[..., 1] - self.start_mm[..., None]) / self.extent_mm[..., None, None]

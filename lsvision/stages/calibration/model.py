@@ -47,10 +47,20 @@ def whitened_residuals(problem: BoardProblem, state: Float[Tensor, "*#batch stat
     Where the corners of a board err together, thirteen of each board, of the same sum of squares.
     """
     theta = BoardState.split(state).theta
-    rows = _by_corner(problem, state) if problem.correlated is None else _by_board(problem, state)
+    rows = residuals_in_sigmas(problem, state).flatten(-3) if problem.correlated is None else _by_board(problem, state)
     if problem.pitch is None:
         return rows
     return torch.cat([rows, (problem.pitch.angle - pitch_angle(problem, theta)) / problem.pitch.sigma], dim=-1)
+
+
+def residuals_in_sigmas(
+    problem: BoardProblem, state: Float[Tensor, "*#batch state"]
+) -> Float[Tensor, "*batch boards corners 3"]:
+    """Residuals of each corner, whitened by its own noise alone; zero where ``valid`` is false."""
+    n = BoardState.split(state).n
+    predicted = scan_position(predicted_points(problem, state), n[..., None, None, :])
+    error = torch.linalg.solve_triangular(problem.noise_chol, (problem.points - predicted)[..., None], upper=False)
+    return torch.where(problem.valid[..., None], error[..., 0], 0.0)
 
 
 def squared_residuals(problem: BoardProblem, state: Float[Tensor, "*#batch state"]) -> Float[Tensor, "*batch boards"]:
@@ -91,13 +101,6 @@ def pitch_angle(problem: BoardProblem, theta: Float[Tensor, "*#batch boards 3"])
     """Angles of the boards' normals about the sensor axis, rad."""
     normal = problem.rotation_at(theta)[..., 2]
     return torch.atan2(-normal[..., 1], normal[..., 2])
-
-
-def _by_corner(problem: BoardProblem, state: Tensor) -> Tensor:
-    n = BoardState.split(state).n
-    predicted = scan_position(predicted_points(problem, state), n[..., None, None, :])
-    error = torch.linalg.solve_triangular(problem.noise_chol, (problem.points - predicted)[..., None], upper=False)
-    return torch.where(problem.valid[..., None], error[..., 0], 0.0).flatten(-3)
 
 
 def _by_board(problem: BoardProblem, state: Tensor) -> Tensor:

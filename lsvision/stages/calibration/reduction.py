@@ -24,8 +24,8 @@ class CorrelatedNoise:
     rows: Float[Tensor, "*batch boards 13 13"]
     log_det: Float[Tensor, "*batch"]
 
-    def at(self, place: tuple[int, ...] | Bool[Tensor, "*batch"]) -> "CorrelatedNoise":
-        """That of one problem of a batch by its indices, or of those of a mask in a row."""
+    def at(self, place: Bool[Tensor, "*batch"] | tuple[int, ...]) -> "CorrelatedNoise":
+        """That of the problems where a mask is true, in a row; of the one at a tuple of indices."""
         return CorrelatedNoise(self.rows[place], self.log_det[place])
 
 

@@ -35,6 +35,8 @@ def sequential(problem: BoardProblem, start: Float[Tensor, "*batch state"], conf
     last state is their smoothed one. Corners that err together are no sequence of measurements: they are taken at once,
     and n stands still. Where a linearisation does not hold, the covariance is the second moment of an n
     that stands still, and the random walk's.
+
+    Corners that err together are no sequence of measurements: they are taken at once, and n stands still.
     """
     if problem.correlated is not None:
         return joint(problem, start, config)

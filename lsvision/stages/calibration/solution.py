@@ -1,15 +1,18 @@
 """Posteriors of a batch of problems, with the noise that their residuals ask for: as given, larger, or correlated."""
 
+import math
 from dataclasses import dataclass
 
+import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from lsvision.estimation import Posterior
 from lsvision.stages.calibration.chosen import merged, scattered
 from lsvision.stages.calibration.config import CalibrationConfig
-from lsvision.stages.calibration.correlated import ErrorsAlongScan, errors_along_scan
+from lsvision.stages.calibration.correlated import Beforehand, ErrorsAlongScan, errors_along_scan, suspicious
 from lsvision.stages.calibration.methods import estimate
+from lsvision.stages.calibration.model import residuals_in_sigmas
 from lsvision.stages.calibration.noise import drifting_noise_scale, noise_scale
 from lsvision.stages.calibration.problem import BoardProblem
 
@@ -39,21 +42,31 @@ def estimate_with_noise(
 ) -> NoisyEstimate:
     """Posteriors by the configured method; where residuals are correlated along the scan, those that allow for it."""
     found = estimate_white(problem, start, config)
-    along = errors_along_scan(problem, found.posterior, found.noise_scale, config.prior_sigma, config.correlated_odds)
+    whitened = residuals_in_sigmas(problem, found.posterior.mean)
+    finite = torch.isfinite(found.posterior.factor).all((-2, -1)) & math.isfinite(config.correlated_odds)
+    doubtful = finite & suspicious(problem, whitened / found.noise_scale.sqrt()[..., None, None, None])
+    known = Beforehand(config.prior_sigma, config.process_sigma or 0.0, config.correlated_odds)
+    along = errors_along_scan(problem, found.posterior.mean, doubtful, known)
     if bool(along.found.any()):
-        found = found.replaced(along.found, estimate_white(along.problem(problem), start[along.found], config))
+        again = estimate_white(along.problem(problem), start[along.found], config)
+        found = found.replaced(along.found, again)
     return NoisyEstimate(found.posterior, found.noise_scale, along)
 
 
 def estimate_white(problem: BoardProblem, start: Float[Tensor, "*batch state"], config: CalibrationConfig) -> Estimate:
     """Posteriors with the noise as the problem has it, or scaled up where the residuals ask for it."""
     posterior = estimate(problem, start, config)
-    if config.method == "sequential" and config.process_sigma and problem.correlated is None:
-        found = Estimate(posterior, drifting_noise_scale(problem, start, posterior.mean, config))
+    if _drifts(problem, config):
+        scale = drifting_noise_scale(problem, start, posterior.mean, config)
     else:
-        found = Estimate(posterior, noise_scale(problem, posterior.mean))
-    larger = found.noise_scale > 1
+        scale = noise_scale(problem, posterior.mean)
+    found, larger = Estimate(posterior, scale), scale > 1
     if not bool(larger.any()):
         return found
-    again = estimate(problem.scaled(found.noise_scale).at(larger), start[larger], config)
-    return found.replaced(larger, Estimate(again, found.noise_scale[larger]))
+    again = estimate(problem.scaled(scale).at(larger), start[larger], config)
+    return found.replaced(larger, Estimate(again, scale[larger]))
+
+
+def _drifts(problem: BoardProblem, config: CalibrationConfig) -> bool:
+    """Whether n walks at random, so that residuals of one n are no noise."""
+    return config.method == "sequential" and bool(config.process_sigma) and problem.correlated is None

@@ -15,7 +15,7 @@ from lsvision.stages.calibration.evidence import NormalEquations, Travel
 from lsvision.stages.calibration.kernels import INTERVALS, KNOTS, kernel_family, wave_length
 from lsvision.stages.calibration.linearise import linearise, point_factor
 from lsvision.stages.calibration.methods import joint
-from lsvision.stages.calibration.model import whitened_residuals
+from lsvision.stages.calibration.model import residuals_in_sigmas, whitened_residuals
 from tests.stages.calibration.boards import RIG, Corners, simulate, thinned
 
 ROUGH, SMOOTH, WAVE = 3, 9, 30  # of the kernel family
@@ -84,11 +84,11 @@ def some_roots() -> torch.Tensor:
 def test_reduced_rows_are_those_of_the_dense_covariance():
     problem, start = small_problem()
     roots = some_roots()
-    noise = with_processes(problem, roots)
+    noise = with_processes(problem, roots[None])
     correlated = dataclasses.replace(problem, correlated=noise)
     covariance = dense_covariance(problem, roots)
     rows, log_det = torch.zeros(()).double(), torch.zeros(()).double()
-    exact = whitened_residuals(
+    exact = residuals_in_sigmas(
         dataclasses.replace(problem, noise_chol=torch.eye(3).double().expand_as(problem.noise_chol)), start
     )
     exact = exact.reshape(2, -1)
@@ -119,7 +119,7 @@ def test_evidence_is_the_restricted_likelihood_of_dense_covariances():
     def naive(root: torch.Tensor) -> torch.Tensor:
         """-2 log likelihood, the poses and n marginalised, by the whitened rows of the whole state."""
         roots = torch.stack([standing[SIDEWAYS], root, standing[DEPTH]])
-        noise = with_processes(problem, roots)
+        noise = with_processes(problem, roots[None])
         correlated = dataclasses.replace(problem, correlated=noise)
         rows = linearise(correlated, posterior.mean, point_factor(posterior.mean)).matrix
         n = posterior.mean[-3:]
@@ -169,7 +169,7 @@ def test_a_suspicion_falls_on_few_sound_sets_and_on_all_shaken_ones():
     for measured, share in ((corners, (0.0, 0.03)), (shaken(corners, 0.03, 233.0), (0.99, 1.0))):
         problem, start = measured.problem()
         posterior = joint(problem, start, CalibrationConfig())
-        suspected = suspicious(problem, posterior.mean, torch.ones(300).double()).double().mean()
+        suspected = suspicious(problem, residuals_in_sigmas(problem, posterior.mean)).double().mean()
         assert share[0] <= suspected <= share[1]
 
 
