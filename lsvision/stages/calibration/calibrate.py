@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -11,18 +12,20 @@ from torch import Tensor
 from lsvision.errors import CalibrationError, ConfigError
 from lsvision.estimation import Info, Posterior
 from lsvision.stages.calibration.config import CalibrationConfig
-from lsvision.stages.calibration.linearise import linearise
+from lsvision.stages.calibration.correlated import ErrorsAlongScan
 from lsvision.stages.calibration.measurements import BoardMeasurements, SoundProblem
-from lsvision.stages.calibration.methods import estimate
-from lsvision.stages.calibration.model import rotations, squared_residuals, translations
+from lsvision.stages.calibration.model import refitted, rotations, squared_residuals, translations
+from lsvision.stages.calibration.noise import board_chi_square
 from lsvision.stages.calibration.observability import observe
 from lsvision.stages.calibration.problem import BoardProblem, MountingPitch
-from lsvision.types import BoardCorners, BoardFit, Calibration, Iteration, Motion, Pose, Rig
+from lsvision.stages.calibration.solution import estimate_with_noise
+from lsvision.stages.calibration.verdict import judge, not_settled, rmse_grew
+from lsvision.types import BoardCorners, BoardFit, Calibration, ErrorAlongScan, Iteration, Motion, Pose, Rig
+
+# Errors along the scan below this part of the largest are not mentioned, though allowed for.
+_FAINT = 0.1
 
 __all__ = ["BatchCalibration", "CalibrationConfig", "calibrate", "calibrate_batch"]
-
-# The noise is scaled up where the given covariance would leave residuals as large with less than this probability.
-_NOISE_TEST_LEVEL = 1e-3
 
 
 @dataclass(frozen=True)
@@ -30,8 +33,9 @@ class BatchCalibration:
     """Calibrations of a batch of problems; a problem whose ``info`` is SINGULAR holds NaN.
 
     ``noise_scale`` is the factor on the given covariance that the residuals asked for, 1 where they are as expected;
-    covariances include it. ``rmse_path_mm`` and ``n_path`` run by iteration from the state before (index 0), and repeat
-    the result past a problem's last iteration.
+    ``along_scan_rms_mm`` and ``along_scan_length_mm`` are of the errors of x, travel and z that are correlated along
+    the scan, zero where none were found; covariances include both. ``rmse_path_mm`` and ``n_path`` run by iteration
+    from the state before (index 0), and repeat the result past a problem's last iteration.
     """
 
     n: Float[Tensor, "*batch 3"]
@@ -43,6 +47,8 @@ class BatchCalibration:
     board_rmse_before_mm: Float[Tensor, "*batch boards"]
     board_rmse_after_mm: Float[Tensor, "*batch boards"]
     noise_scale: Float[Tensor, "*batch"]
+    along_scan_rms_mm: Float[Tensor, "*batch 3"]
+    along_scan_length_mm: Float[Tensor, "*batch 3"]
     iterations: Int[Tensor, "*batch"]
     converged: Bool[Tensor, "*batch"]
     info: Int[Tensor, "*batch"]
@@ -68,22 +74,29 @@ def calibrate(boards: Sequence[BoardCorners], rig: Rig, config: CalibrationConfi
             if bad:
                 raise CalibrationError(f"{board.scan}: {flaw.value}")
     solution = _solve(measured, config)
-    batch, noise_scale = solution.summary(), float(solution.noise_scale)
+    batch, scale = solution.summary(), float(solution.noise_scale)
     if int(batch.info) == Info.SINGULAR:
         raise CalibrationError(
             f"{', '.join(board.scan for board in boards)}: the corners do not determine the boards' poses"
         )
+    observability = observe(solution.weighed, solution.posterior.mean, config.prior_sigma, scale)
+    iterations, converged = _iterations(batch), bool(batch.converged)
+    contradictions = rmse_grew(iterations[0].rmse_mm, iterations[-1].rmse_mm)
+    judged = judge(not_settled(converged, int(batch.iterations)), contradictions, observability)
     return Calibration(
         method=config.method,
         motion=Motion(batch.n, batch.covariance),
-        rmse_before_mm=float(batch.rmse_path_mm[0]),
-        rmse_after_mm=float(batch.rmse_path_mm[-1]),
-        iterations=_iterations(batch),
-        boards=_board_fits(boards, batch),
-        observability=observe(solution.problem, solution.posterior.mean, config.prior_sigma, noise_scale),
+        rmse_before_mm=iterations[0].rmse_mm,
+        rmse_after_mm=iterations[-1].rmse_mm,
+        iterations=iterations,
+        boards=_board_fits(boards, batch, board_chi_square(solution.problem, solution.posterior)),
+        observability=observability,
         rig=rig,
-        converged=bool(batch.converged),
-        noise_scale=noise_scale,
+        verdict=judged.verdict,
+        reasons=judged.reasons,
+        converged=converged,
+        noise_scale=scale,
+        errors_along_scan=_errors_along_scan(batch),
     )
 
 
@@ -111,11 +124,20 @@ def calibrate_batch(
 
 @dataclass(frozen=True)
 class _Solution:
-    """Problems of a batch with their posteriors; these have the noise scaled, the problems as it was given."""
+    """Problems of a batch with their posteriors; these have the noise scaled, the problems as it was given.
+
+    ``along_scan`` are the errors that the posteriors allow for besides.
+    """
 
     problem: BoardProblem
     posterior: Posterior
     noise_scale: Float[Tensor, "*batch"]
+    along_scan: ErrorsAlongScan
+
+    @property
+    def weighed(self) -> BoardProblem:
+        """The problems with the noise that the posteriors allow for, but for its scale."""
+        return replace(self.problem, correlated=self.along_scan.noise)
 
     def summary(self) -> BatchCalibration:
         """The solution as motion and poses of the boards, and its path."""
@@ -123,7 +145,7 @@ class _Solution:
         singular = posterior.info == int(Info.SINGULAR)
         state = torch.where(singular[..., None], torch.nan, posterior.mean)
         path = torch.where(singular[..., None], torch.nan, posterior.path)
-        squared, corners = squared_residuals(problem, path), problem.valid.sum(-1)
+        squared, corners = self._squared_residuals(path), problem.valid.sum(-1)
         board_rmse = (squared / corners).sqrt()
         motion_factor = torch.where(singular[..., None, None], torch.nan, posterior.factor[..., -3:, :])
         return BatchCalibration(
@@ -136,26 +158,30 @@ class _Solution:
             board_rmse_before_mm=board_rmse[0],
             board_rmse_after_mm=board_rmse[-1],
             noise_scale=torch.where(singular, torch.nan, self.noise_scale),
+            along_scan_rms_mm=self.along_scan.rms_mm,
+            along_scan_length_mm=self.along_scan.length_mm,
             iterations=posterior.iterations,
             converged=posterior.converged & ~singular,
             info=posterior.info,
         )
 
+    def _squared_residuals(self, path: Tensor) -> Tensor:
+        """Sums by iteration and board, mm²; errors along the scan are no fault of n, and poses take what they can."""
+        squared, found = squared_residuals(self.problem, path), self.along_scan.found
+        if bool(found.any()):
+            shaken = self.problem.at(found)
+            squared[:, found] = squared_residuals(shaken, refitted(shaken, path[:, found]))
+        return squared
+
 
 def _solve(measured: BoardMeasurements, config: CalibrationConfig) -> _Solution:
-    """The problems estimated, once more where their residuals ask for a larger noise."""
+    """The problems estimated, once more where their residuals ask for a larger noise or are correlated."""
     config = config.resolved()
     _check(config, measured.points.shape[-3])
     posed = SoundProblem.of(measured, _mounting_pitch(config))
-    problem, start = posed.problem, posed.start
-    posterior = estimate(problem, start, config)
-    drifting = config.method == "sequential" and bool(config.process_sigma)  # residuals of one n are then no noise
-    scale = torch.ones_like(start[..., 0]) if drifting else _noise_scale(problem, posterior)
-    if bool((scale > 1).any()):
-        noisier = replace(problem, noise_chol=problem.noise_chol * scale.sqrt()[..., None, None, None, None])
-        posterior = _merge(scale > 1, estimate(noisier, start, config), posterior)
-    info = torch.where(posed.sound, posterior.info, int(Info.SINGULAR))
-    return _Solution(problem, replace(posterior, info=info), scale)
+    found = estimate_with_noise(posed.problem, posed.start, config)
+    info = torch.where(posed.sound, found.posterior.info, int(Info.SINGULAR))
+    return _Solution(posed.problem, replace(found.posterior, info=info), found.noise_scale, found.along_scan)
 
 
 def _check(config: CalibrationConfig, boards: int) -> None:
@@ -170,36 +196,6 @@ def _mounting_pitch(config: CalibrationConfig) -> MountingPitch | None:
     return MountingPitch(math.radians(config.mounting_pitch_deg), math.radians(config.mounting_pitch_sigma_deg))
 
 
-def _noise_scale(problem: BoardProblem, posterior: Posterior) -> Tensor:
-    """Reduced chi-square of the residuals where they are larger than chance allows, else 1.
-
-    They are weighed with the linearisation's error as well: where only the prior determines n, the mean of the
-    posterior does not lie on the curve of poses and n that fit.
-    """
-    corners_alone = problem if problem.pitch is None else replace(problem, pitch=None)
-    rows = linearise(corners_alone, posterior.mean, posterior.factor)
-    squared = rows.matrix[..., -1].square().sum(-1)
-    freedom = 3.0 * problem.valid.sum((-2, -1)) - posterior.mean.shape[-1]
-    unlikely = torch.special.gammaincc(freedom / 2, squared / 2) < _NOISE_TEST_LEVEL
-    return torch.where(unlikely, squared / freedom, 1.0)
-
-
-def _merge(chosen: Tensor, one: Posterior, other: Posterior) -> Posterior:
-    """``one`` for the chosen problems of a batch, ``other`` for the rest."""
-    length = max(len(one.path), len(other.path))
-    one_path, other_path = (
-        torch.cat([p.path, p.path[-1:].expand(length - len(p.path), *p.path.shape[1:])]) for p in (one, other)
-    )
-    return Posterior(
-        torch.where(chosen[..., None], one.mean, other.mean),
-        torch.where(chosen[..., None, None], one.factor, other.factor),
-        torch.where(chosen[..., None], one_path, other_path),
-        torch.where(chosen, one.iterations, other.iterations),
-        torch.where(chosen, one.converged, other.converged),
-        torch.where(chosen, one.info, other.info),
-    )
-
-
 def _iterations(batch: BatchCalibration) -> tuple[Iteration, ...]:
     stretch = torch.linalg.vector_norm(batch.n_path, dim=-1)
     return tuple(
@@ -210,7 +206,16 @@ def _iterations(batch: BatchCalibration) -> tuple[Iteration, ...]:
     )
 
 
-def _board_fits(boards: Sequence[BoardCorners], batch: BatchCalibration) -> tuple[BoardFit, ...]:
+def _errors_along_scan(batch: BatchCalibration) -> tuple[ErrorAlongScan, ...]:
+    """Those of one problem that are not much smaller than the largest."""
+    rms, length = batch.along_scan_rms_mm.tolist(), batch.along_scan_length_mm.tolist()
+    components: tuple[Literal["x", "travel", "z"], ...] = ("x", "travel", "z")
+    return tuple(
+        ErrorAlongScan(*error) for error in zip(components, rms, length, strict=True) if error[1] > _FAINT * max(rms)
+    )
+
+
+def _board_fits(boards: Sequence[BoardCorners], batch: BatchCalibration, chi_square: Tensor) -> tuple[BoardFit, ...]:
     return tuple(
         BoardFit(
             scan=board.scan,
@@ -218,6 +223,7 @@ def _board_fits(boards: Sequence[BoardCorners], batch: BatchCalibration) -> tupl
             pose=Pose(batch.rotation[i], batch.translation_mm[i]),
             rmse_before_mm=float(batch.board_rmse_before_mm[i]),
             rmse_after_mm=float(batch.board_rmse_after_mm[i]),
+            reduced_chi_square=float(chi_square[i]),
         )
         for i, board in enumerate(boards)
     )

@@ -24,7 +24,8 @@ class CalibrationConfig(Checked):
     does; ``sequential`` filters corner by corner in line order, so that n may drift along the scans; ``least_squares``
     is the maximum of the posterior by Levenberg-Marquardt, the reference that the filter is compared with. The poses'
     prior lies around the poses that fit best under n = (0, 1, 0); infinite sigmas make it flat, so that no corner
-    counts twice. An option that is None takes the value of the method.
+    counts twice. An option that is None takes the value of the method. Errors that are correlated along the scan, as of
+    vibration or of the encoder, are allowed for where they make the corners ``correlated_odds`` times as probable.
     """
 
     method: CalibrationMethod = "joint"
@@ -36,6 +37,7 @@ class CalibrationConfig(Checked):
     two_step_threshold_mm: NonNegative = 0.05  # RMSE below which Alg. 1 ends
     two_step_max_iterations: PositiveInt = 20
     process_sigma: NonNegative | None = None  # of the random walk of n per square root of a mm; sequential only
+    correlated_odds: PositiveOrInfinite = 50.0  # evidence from which errors along the scan are modelled; .inf: never
     mounting_pitch_deg: AcuteAngle | None = None  # known angle of a single board's normal about the sensor axis
     mounting_pitch_sigma_deg: Positive = 0.1
 

@@ -82,7 +82,11 @@ def sequential(problem: BoardProblem, start: Float[Tensor, "*batch state"], conf
 
     The result is n at the end of the last scan. Each pass filters from the same prior with the corners linearised about
     the pass before: the boards' poses do not move, so that their last state is their smoothed one.
+
+    Corners that err together are no sequence of measurements: they are taken at once, and n stands still.
     """
+    if problem.correlated is not None:
+        return joint(problem, start, config)
     order = LineOrder.of(problem)
     process_chol, wide = order.process_chol(config.process_sigma or 0.0), _wide_chol(start, config)
     unit = torch.eye(3, dtype=start.dtype, device=start.device)
