@@ -16,6 +16,7 @@ from lsvision.archive.depth_store import open_depth_store, remove_partial_chunks
 from lsvision.archive.identity import ScanFiles
 from lsvision.archive.product import damage_of, is_finished
 from lsvision.errors import LsvisionError
+from lsvision.image.levels import PairLevels
 from lsvision.io import (
     MeasuredCells,
     ProductRows,
@@ -30,7 +31,7 @@ from lsvision.stages.correction.correct import Correction
 from lsvision.stages.correction.grid import plan_product
 from lsvision.stages.disparity.config import DisparityConfig
 from lsvision.stages.disparity.depth import depth_of
-from lsvision.types import Motion, Scan
+from lsvision.types import Motion, Scan, StereoPair
 
 
 class Work(Protocol):
@@ -97,7 +98,7 @@ class MatchStrip:
         scan = _open_scan(self.scan)
         start = self.number * self.config.work_lines
         stop = min(start + self.config.work_lines, scan.lines)
-        depth = depth_of(scan, self.config).read(start, stop)
+        depth = depth_of(scan, self.config, _levels_of(self.scan)).read(start, stop)
         with naming_full_disk(self.depth_store):
             write_depth(self.depth_store, start, depth, with_sigma=self.with_sigma)
         return StripResult(stop - start, MeasuredCells(int(torch.isfinite(depth.z).sum())))
@@ -176,6 +177,13 @@ class VerifyProduct:
 @lru_cache(maxsize=2)
 def _open_scan(files: ScanFiles) -> Scan:
     return read_scan(files.path, repair_encoder=files.repair_encoder)
+
+
+@lru_cache(maxsize=2)
+def _levels_of(files: ScanFiles) -> PairLevels | None:
+    """Those of a scan with two images: the sampled lines of a long scan take as long to read as a strip."""
+    images = _open_scan(files).images
+    return PairLevels.of(images) if isinstance(images, StereoPair) else None
 
 
 def _open_correction(source: CorrectionInput) -> Correction:

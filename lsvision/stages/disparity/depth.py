@@ -7,7 +7,7 @@ from functools import cached_property
 import torch
 
 from lsvision.geometry import depth_at, depth_sigma
-from lsvision.image.brightness import white_level
+from lsvision.image.levels import PairLevels
 from lsvision.stages.disparity.config import DisparityConfig
 from lsvision.stages.disparity.match import measure_block
 from lsvision.types import Depth, DepthSource, DepthView, Rig, Scan, StereoPair, StoredDepth
@@ -17,13 +17,15 @@ from lsvision.types import Depth, DepthSource, DepthView, Rig, Scan, StereoPair,
 class MatchedDepth:
     """The depth of a stereo scan; the last blocks stay in memory, since neighbouring reads overlap.
 
-    The sigma is None where the matcher does not refine: nothing is known about it then.
+    ``levels`` of the images are read from them where they are not given. The sigma is None where the matcher does not
+    refine: nothing is known about it then.
     """
 
     images: StereoPair
     rig: Rig
     config: DisparityConfig = field(default_factory=DisparityConfig)
     kept_blocks: int = 3
+    levels: PairLevels | None = None
     _blocks: OrderedDict[int, Depth] = field(default_factory=OrderedDict, init=False, repr=False)
 
     @property
@@ -54,19 +56,23 @@ class MatchedDepth:
         return self._blocks[index]
 
     @cached_property
-    def _white(self) -> float:
-        return white_level(self.images.left, self.images.right)
+    def _levels(self) -> PairLevels:
+        return self.levels or PairLevels.of(self.images)
 
     def _match(self, index: int) -> Depth:
-        match = measure_block(self.images.left, self.images.right, self.rig, self.config, self._white, index)
+        match = measure_block(self.images, self._levels, self.rig, self.config, index)
         z = depth_at(self.rig, match.disparity)
         return Depth(z, depth_sigma(self.rig, z, match.sigma) if self.config.tells_sigma else None)
 
 
-def depth_of(scan: Scan, config: DisparityConfig | None = None) -> DepthSource:
-    """The scan's own depth map where its camera computed one, else the one matched from its two images."""
+def depth_of(scan: Scan, config: DisparityConfig | None = None, levels: PairLevels | None = None) -> DepthSource:
+    """The scan's own depth map where its camera computed one, else the one matched from its two images.
+
+    Args:
+        levels: of the images, if they are known already.
+    """
     match scan.images:
         case DepthView(_, depth):
             return StoredDepth(depth)
         case StereoPair() as pair:
-            return MatchedDepth(pair, scan.rig, config or DisparityConfig())
+            return MatchedDepth(pair, scan.rig, config or DisparityConfig(), levels=levels)

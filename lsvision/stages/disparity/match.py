@@ -7,15 +7,17 @@ import torch
 from torch import Tensor
 
 from lsvision.geometry import disparity_at_height
-from lsvision.image.brightness import gray, gray_bytes, white_level
+from lsvision.image.brightness import gray, gray_bytes
+from lsvision.image.levels import PairLevels
 from lsvision.image.stereo.agreement import occluded
 from lsvision.image.stereo.blocks import block_side, enlarged
+from lsvision.image.stereo.clipping import UnusableSamples
 from lsvision.image.stereo.coarse_to_fine import match_coarse_to_fine
 from lsvision.image.stereo.refine import RefineOptions, refine_disparity
 from lsvision.image.stereo.sgbm import GrayPair, Search, match_sgbm
 from lsvision.image.tiling import HaloRange
 from lsvision.stages.disparity.config import DisparityConfig
-from lsvision.types import LineImage, Rig, TensorImage
+from lsvision.types import Rig, StereoPair, TensorImage
 
 _BLANK_TEST_STEP = 9  # every ninth line shows whether a camera saw anything
 
@@ -46,45 +48,44 @@ def measure_strip(left: Tensor, right: Tensor, rig: Rig, config: DisparityConfig
 
     A block in which one of the cameras saw no more than its noise has no match anywhere.
     """
-    pair = TensorImage(left), TensorImage(right)
-    white = white_level(*pair)
-    blocks = [measure_block(*pair, rig, config, white, index) for index in range(-(-len(left) // config.block_lines))]
+    pair = StereoPair(TensorImage(left), TensorImage(right))
+    levels = PairLevels.of(pair)
+    blocks = [measure_block(pair, levels, rig, config, index) for index in range(-(-len(left) // config.block_lines))]
     if len(blocks) == 1:
         return blocks[0]
     return StripMatch(torch.cat([block.disparity for block in blocks]), torch.cat([block.sigma for block in blocks]))
 
 
-def measure_block(
-    left: LineImage, right: LineImage, rig: Rig, config: DisparityConfig, white: float, index: int
-) -> StripMatch:
+def measure_block(pair: StereoPair, levels: PairLevels, rig: Rig, config: DisparityConfig, index: int) -> StripMatch:
     """Disparity and sigma of the lines of one block, of images of any length.
 
     Args:
-        white: the largest value that pixels can have.
+        levels: of the whole images.
         index: of the block, which begins at line ``index * config.block_lines``.
     """
-    config = config.for_width(left.shape[1])
-    lines = HaloRange.at(index * config.block_lines, config.block_lines, config.halo_lines or 0, left.shape[0])
-    gray_left, gray_right = (_gray(image.read(lines.outer_start, lines.outer_stop), white) for image in (left, right))
-    match = _measure(gray_left, gray_right, rig, config)
+    config = config.for_width(pair.left.shape[1])
+    lines = HaloRange.at(index * config.block_lines, config.block_lines, config.halo_lines or 0, pair.left.shape[0])
+    left, right = (image.read(lines.outer_start, lines.outer_stop) for image in (pair.left, pair.right))
+    unusable = UnusableSamples(levels.left.unusable(left), levels.right.unusable(right))
+    match = _measure(_gray(left, levels.white), _gray(right, levels.white), unusable, rig, config)
     return StripMatch(match.disparity[lines.inner], match.sigma[lines.inner])
 
 
 def _gray(image: Tensor, white: float) -> Tensor:
     """Brightness on a scale of 0..255, as is the configured noise: bytes of byte images, float32 of others."""
-    return gray_bytes(image) if image.dtype == torch.uint8 else gray(image) * (255.0 / white)
+    return gray_bytes(image) if image.dtype == torch.uint8 and white == 255.0 else gray(image) * (255.0 / white)
 
 
-def _measure(left: Tensor, right: Tensor, rig: Rig, config: DisparityConfig) -> StripMatch:
-    """Disparity and sigma of a pair of grey images: search, then refinement."""
+def _measure(left: Tensor, right: Tensor, unusable: UnusableSamples, rig: Rig, config: DisparityConfig) -> StripMatch:
+    """Disparity and sigma of a pair of grey images: search, then then refinement."""
     # In noise alone every pixel would find a match somewhere.
     if any(float(image[::_BLANK_TEST_STEP].float().std()) <= config.refine_noise for image in (left, right)):
-        disparity = torch.full(left.shape, torch.nan)
-    else:
-        disparity = _search(left, right, rig, config)
+        return StripMatch(torch.full(left.shape, torch.nan), torch.full(left.shape, torch.nan))
+    searched = _search(left, right, rig, config)
+    block, (lines, width) = block_side(left, searched), left.shape
+    disparity = unusable.removed_from(searched, block)
     if not config.refine_iterations:
-        lines, width = left.shape
-        disparity = enlarged(disparity, block_side(left, disparity))[:lines, :width]
+        disparity = enlarged(disparity, block)[:lines, :width]
         return StripMatch(disparity, torch.full_like(disparity, torch.nan))
     options = RefineOptions(
         window=config.refine_window,
