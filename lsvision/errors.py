@@ -1,5 +1,6 @@
 """Errors whose cause is the data, a file or an option, not the caller's code."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 
@@ -27,6 +28,17 @@ class FileFormatError(LsvisionError):
         return type(self), (self.path, self.problem, self.key)
 
 
+class ScanChangedError(LsvisionError):
+    """A scan whose files are not those any more that a run planned to read."""
+
+    def __init__(self, path: Path | str) -> None:
+        super().__init__(f"{path}: changed while it was being read; the next run starts it afresh")
+        self.path = Path(path)
+
+    def __reduce__(self) -> tuple[type, tuple[Path]]:
+        return type(self), (self.path,)
+
+
 class WriteError(LsvisionError):
     """A file that cannot be written, as on a full disk; the message names it."""
 
@@ -37,6 +49,17 @@ class BoardNotFoundError(LsvisionError):
 
 class CalibrationError(LsvisionError):
     """A calibration that cannot be computed, or does not fit the scan that it should correct."""
+
+
+class UnusableCalibrationError(CalibrationError):
+    """A calibration without a usable n, by its file, its verdict and the reasons for it."""
+
+    def __init__(self, path: str, verdict: str, reasons: Sequence[str]) -> None:
+        super().__init__(f"{path}: the calibration is {verdict}: {'; '.join(reasons) or 'it gives no reason'}")
+        self.path, self.verdict, self.reasons = path, verdict, tuple(reasons)
+
+    def __reduce__(self) -> tuple[type, tuple[str, str, tuple[str, ...]]]:
+        return type(self), (self.path, self.verdict, self.reasons)
 
 
 class NothingMeasuredError(LsvisionError):

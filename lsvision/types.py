@@ -18,6 +18,10 @@ from lsvision.schema import Checked, IntFrom2, NonNegative, Positive, PositiveIn
 
 Transport = Literal["forward", "reverse"]
 CalibrationMethod = Literal["joint", "two_step", "sequential", "least_squares"]
+# What a calibration is worth, the first that holds from the right: see ``Calibration``.
+Verdict = Literal["determined", "prior-dominated", "inconsistent", "not converged"]
+# Verdicts without a usable n, as an option names them that uses one all the same.
+RefusedVerdict = Literal["inconsistent", "not_converged"]
 
 
 @dataclass(frozen=True)
@@ -244,6 +248,12 @@ class Motion:
         """Standard deviation of each component of n."""
         return self.covariance.diagonal(dim1=-2, dim2=-1).sqrt()
 
+    @property
+    def drift_mm_per_m(self) -> tuple[float, float]:
+        """How far the object moves sideways (X) and in depth (Z) per metre along Y, mm."""
+        n1, n2, n3 = self.n.tolist()
+        return 1000.0 * n1 / n2, 1000.0 * n3 / n2
+
 
 @dataclass(frozen=True)
 class Iteration:
@@ -256,13 +266,18 @@ class Iteration:
 
 @dataclass(frozen=True)
 class BoardFit:
-    """Pose of one board in the scan frame, and its residuals before and after calibration."""
+    """Pose of one board in the scan frame, and its residuals before and after calibration.
+
+    ``reduced_chi_square`` compares the residuals after with the corners' given covariance: 1 where they are as
+    expected, None where it is not known.
+    """
 
     scan: str
     corners: int
     pose: Pose
     rmse_before_mm: float
     rmse_after_mm: float
+    reduced_chi_square: float | None = None
 
 
 @dataclass(frozen=True)
@@ -279,9 +294,13 @@ class ObservedDirection:
 class Observability:
     """Whether the boards determine n, direction by direction, and what to scan next."""
 
-    verdict: Literal["determined", "prior-dominated"]
     directions: tuple[ObservedDirection, ...]
     advice: str
+
+    @property
+    def determined(self) -> bool:
+        """Whether the boards show every direction."""
+        return all(direction.observed for direction in self.directions)
 
 
 @dataclass(frozen=True)
@@ -297,6 +316,9 @@ class Provenance:
 class Calibration:
     """The motion of an object under a rig, measured on one or more boards.
 
+    The verdict is ``not converged`` where the estimate did not settle; else ``inconsistent`` where the boards
+    contradict each other, what was said of them, or the model; else ``prior-dominated`` where they leave a direction of
+    n to the prior; else ``determined``. ``reasons`` are the sentences that say why it is not ``determined``.
     ``noise_scale`` is how many times larger than the corners' given covariance their residuals are, 1 where they are as
     expected; the covariance of n allows for it.
     """
@@ -309,6 +331,8 @@ class Calibration:
     boards: tuple[BoardFit, ...]
     observability: Observability
     rig: Rig
+    verdict: Verdict = "determined"
+    reasons: tuple[str, ...] = ()
     converged: bool = True
     noise_scale: float = 1.0
     provenance: Provenance = field(default_factory=lambda: Provenance("", ""))
@@ -317,6 +341,11 @@ class Calibration:
     def improvement(self) -> float:
         """Share of the RMSE that the calibration removed, 1 - after / before."""
         return 1.0 - self.rmse_after_mm / self.rmse_before_mm
+
+    @property
+    def usable(self) -> bool:
+        """Whether its n may correct scans: the verdict is ``determined`` or ``prior-dominated``."""
+        return self.verdict in ("determined", "prior-dominated")
 
 
 @dataclass(frozen=True)
@@ -356,7 +385,8 @@ class ProductStrip:
         color: in the scan's dtype.
         height: float32, mm towards the cameras from the middle of the plane of zero disparity, NaN where not measured.
         valid: where the height was measured.
-        source: float32 (line, column) of the scan that the colour came from, NaN where no line saw the cell.
+        source: (line, column) of the scan that the colour came from, NaN where no line saw the cell; float32, for long
+            scans float64.
         sigma: float32, mm, standard deviations of (q_x, q_y, q_z), where they were asked for.
     """
 

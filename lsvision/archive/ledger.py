@@ -8,12 +8,12 @@ from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any, Literal
 
+from lsvision.archive.tables import VERSION, bring_up_to_date, version_of
 from lsvision.errors import FileFormatError, LsvisionError, WriteError
 from lsvision.io import MeasuredCells
 
 LEDGER_FILE = "ledger.sqlite"
 
-_VERSION = 2  # of the tables; version 1 recorded none
 _WAIT_SECONDS = 5.0
 _OF_THE_DISK = {
     sqlite3.SQLITE_IOERR, sqlite3.SQLITE_CANTOPEN, sqlite3.SQLITE_READONLY, sqlite3.SQLITE_PERM, sqlite3.SQLITE_BUSY,
@@ -22,24 +22,6 @@ _OF_THE_DISK = {
 
 Stage = Literal["disparity", "product"]
 Status = Literal["running", "stopped", "done", "failed"]  # a scan as running while no run is at work was stopped
-
-_TABLES = (
-    """
-    CREATE TABLE scans (
-        scan TEXT PRIMARY KEY, path TEXT NOT NULL, status TEXT NOT NULL, error TEXT NOT NULL, lines INTEGER NOT NULL,
-        seconds REAL NOT NULL, measured_share REAL NOT NULL, stamp TEXT NOT NULL, input_sha256 TEXT NOT NULL,
-        calibration TEXT NOT NULL, calibration_sha256 TEXT NOT NULL, config_sha256 TEXT NOT NULL, version TEXT NOT NULL
-    )
-    """,
-    """
-    CREATE TABLE strips (
-        scan TEXT NOT NULL, stage TEXT NOT NULL, number INTEGER NOT NULL, key TEXT NOT NULL, status TEXT NOT NULL,
-        error TEXT NOT NULL, lines INTEGER NOT NULL, seconds REAL NOT NULL, measured_cells INTEGER NOT NULL,
-        lowest_mm REAL NOT NULL, highest_mm REAL NOT NULL, runs INTEGER NOT NULL,
-        PRIMARY KEY (scan, stage, number)
-    )
-    """,
-)
 
 log = logging.getLogger(__name__)
 
@@ -50,6 +32,8 @@ class ScanRow:
 
     ``stamp`` changes when its files are touched (paths, sizes, times), ``input_sha256`` when their content changes.
     ``seconds`` is the work on all its strips, ``measured_share`` the share of the product's cells with a height.
+    ``verdict`` is its calibration's, empty where it is not known; ``sideways_mm_per_m`` and ``in_depth_mm_per_m`` are
+    the motion that was corrected, ``drift_sigma_mm_per_m`` the largest standard deviation of a position, mm per metre.
     """
 
     scan: str
@@ -65,6 +49,10 @@ class ScanRow:
     calibration_sha256: str = ""
     config_sha256: str = ""
     version: str = ""
+    verdict: str = ""
+    sideways_mm_per_m: float = 0.0
+    in_depth_mm_per_m: float = 0.0
+    drift_sigma_mm_per_m: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -93,7 +81,8 @@ class StripRow:
 class Ledger:
     """The open ledger; every call that writes is one transaction. One process writes, any number may read.
 
-    A ledger of an earlier version is emptied: what it recorded was made by an earlier version and is made again.
+    A ledger of version 1 is emptied: what it recorded was made by an earlier version and is made again. One of
+    version 2 gets the columns that it lacks.
 
     Raises:
         FileFormatError: the file is no ledger, or one of a later version.
@@ -165,25 +154,15 @@ class Ledger:
 
     def _create_tables(self) -> None:
         """Create the tables where there are none of this version."""
-        if self._version() == _VERSION:
+        if version_of(self._db) == VERSION:
             return
         self._db.execute("BEGIN IMMEDIATE")  # of several that open it at once, one creates them
         with self._db:
-            version = self._version()
-            if version > _VERSION:
-                raise FileFormatError(self._path, f"made by a later version: {version}, expected up to {_VERSION}")
-            if version < _VERSION:
-                old = self._db.execute("SELECT name FROM sqlite_master WHERE name IN ('scans', 'strips')").fetchall()
-                if old:
-                    log.warning("%s is of an earlier version and starts anew: its scans are made again", self._path)
-                for (name,) in old:
-                    self._db.execute(f"DROP TABLE {name}")
-                for table in _TABLES:
-                    self._db.execute(table)
-                self._db.execute(f"PRAGMA user_version = {_VERSION}")
-
-    def _version(self) -> int:
-        return int(self._db.execute("PRAGMA user_version").fetchone()[0])
+            version = version_of(self._db)
+            if version > VERSION:
+                raise FileFormatError(self._path, f"made by a later version: {version}, expected up to {VERSION}")
+            if bring_up_to_date(self._db, version):
+                log.warning("%s is of an earlier version and starts anew: its scans are made again", self._path)
 
     def _write(self, statement: str, values: Mapping[str, Any] | tuple[Any, ...]) -> None:
         try:
@@ -221,7 +200,9 @@ def ledger_lines(rows: Mapping[str, ScanRow]) -> Iterator[str]:
         result = (
             row.error if row.status == "failed" else f"{row.lines} lines, {100 * row.measured_share:.1f} % measured"
         )
-        yield f"{key:{width}}  {row.status:7}  {row.seconds:8.1f} s  {result}"
+        known = row.verdict and row.status != "failed"
+        drift = f"{row.verdict} to ±{row.drift_sigma_mm_per_m:.2g} mm/m, " if known else ""
+        yield f"{key:{width}}  {row.status:7}  {row.seconds:8.1f} s  {drift}{result}"
 
 
 def _upsert(table: str, schema: type) -> str:

@@ -1,7 +1,7 @@
 """The archive of one scan, worked through in this process."""
 
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,6 +18,7 @@ from lsvision.archive.sources.calibrations import read_calibrations
 from lsvision.archive.sources.catalogue import SCAN_FILE, Found
 from lsvision.errors import LsvisionError
 from lsvision.io import MeasuredCells
+from lsvision.types import RefusedVerdict
 
 
 @dataclass(frozen=True)
@@ -28,12 +29,15 @@ class FinishedProduct:
     measured: MeasuredCells
 
 
-def plan_one(scan: Path | str, calibration: Path | str, processing: Processing) -> PlannedScan:
+def plan_one(
+    scan: Path | str, calibration: Path | str, processing: Processing, accept: Sequence[RefusedVerdict] = ()
+) -> PlannedScan:
     """Plan the product of one scan, which is named after its folder.
 
     Args:
         scan: the scan's folder, or its ``scan.yaml``.
         calibration: its calibration, or a folder of several to choose from by rig and date.
+        accept: see ``read_calibrations``.
 
     Raises:
         LsvisionError: see ``plan_scan`` and ``read_calibrations``.
@@ -41,7 +45,7 @@ def plan_one(scan: Path | str, calibration: Path | str, processing: Processing) 
     folder = Path(scan).parent if Path(scan).name == SCAN_FILE else Path(scan)
     found = Found(folder.resolve().name, folder.absolute())
     stamp_of(found.path)  # of two missing files, the scan is named first
-    return plan_scan(found, read_calibrations(calibration), processing)
+    return plan_scan(found, read_calibrations(calibration, accept), processing)
 
 
 def process_one(planned: PlannedScan, processing: Processing, output: Path, progress: Progress) -> FinishedProduct:

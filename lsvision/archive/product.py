@@ -12,6 +12,8 @@ from lsvision.io import ProductLayout, check_product, read_product, read_scan
 from lsvision.io.atomic import check_replaceable
 from lsvision.io.inside import path_inside
 from lsvision.io.product.layout import ROOT_METADATA
+from lsvision.stages.correction.grid import source_dtype
+from lsvision.stages.correction.uncertainty import drift_per_metre
 
 _LONGEST_NAME = 200  # a product that is written has 48 characters more, and disks take 255
 
@@ -39,7 +41,9 @@ def product_layout(planned: PlannedScan, processing: Processing, input_sha256: s
         FileFormatError: the scan cannot be read any more.
     """
     scan = read_scan(planned.files.path, repair_encoder=processing.repair_encoder)
-    motion = planned.calibration.calibration.motion
+    calibration = planned.calibration.calibration
+    motion = calibration.motion
+    sideways, in_depth = motion.drift_mm_per_m
     return ProductLayout(
         grid=planned.grid,
         channels=scan.left.shape[2],
@@ -55,11 +59,16 @@ def product_layout(planned: PlannedScan, processing: Processing, input_sha256: s
             "attributes": dict(scan.attributes),
             "calibration": str(planned.calibration.path),
             "calibration_sha256": planned.calibration.sha256,
+            "calibration_verdict": calibration.verdict,
+            "calibration_reasons": list(calibration.reasons),
+            "motion_mm_per_m": {"sideways": sideways, "in_depth": in_depth},
+            "drift_sigma_mm_per_m": list(drift_per_metre(motion)),
             "disparity": asdict(processing.disparity),
             "correction": asdict(planned.correction),
             "key": key,
         },
         uncertainty=planned.correction.uncertainty,
+        source_dtype=source_dtype(planned.lines),
     )
 
 

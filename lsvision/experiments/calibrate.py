@@ -6,7 +6,7 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 from lsvision import __version__
-from lsvision.errors import CalibrationError, ConfigError
+from lsvision.errors import CalibrationError, ConfigError, UnusableCalibrationError
 from lsvision.experiments.settings import RunSettings, settings_sha256
 from lsvision.io import read_scan, scan_sha256, write_calibration, write_json
 from lsvision.report import calibration_report, calibration_summary
@@ -33,7 +33,11 @@ class CalibrateSettings(RunSettings):
 
 
 def run_calibrate(settings: CalibrateSettings, folder: Path) -> None:
-    """Find the board in every scan, calibrate, write the calibration and its report."""
+    """Find the board in every scan, calibrate, write the calibration and its report.
+
+    Raises:
+        UnusableCalibrationError: the calibration is inconsistent or did not converge; its files are written.
+    """
     scans = read_scans(settings.scans)
     boards = find_boards(scans, settings.board, settings.corners)
     calibration = calibrate(boards, scans[0].rig, settings.calibration)
@@ -48,6 +52,8 @@ def run_calibrate(settings: CalibrateSettings, folder: Path) -> None:
     write_json(folder / "summary.json", _summary(calibration))
     calibration_report(calibration, boards, asdict(settings), folder)
     log.info("%s\nwrote %s and %s", calibration_summary(calibration), target, folder / "report.html")
+    if not calibration.usable:
+        raise UnusableCalibrationError(str(target), calibration.verdict, calibration.reasons)
 
 
 def read_scans(paths: Sequence[str]) -> list[Scan]:
@@ -82,7 +88,9 @@ def _summary(calibration: Calibration) -> dict:
     return {
         "method": calibration.method,
         "boards": len(calibration.boards),
-        "verdict": calibration.observability.verdict,
+        "verdict": calibration.verdict,
+        "reasons": list(calibration.reasons),
+        "noise_scale": calibration.noise_scale,
         "n": calibration.motion.n.tolist(),
         "sigma": calibration.motion.sigma.tolist(),
         "stretch": calibration.motion.stretch,

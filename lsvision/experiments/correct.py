@@ -10,10 +10,12 @@ from lsvision.image.tiling import keep_freed_memory
 from lsvision.io import ExportFormat, export_product, read_product, write_json
 from lsvision.report import product_report
 from lsvision.report.progress import ProgressBars, progress_bars
+from lsvision.report.summary import drift_in_words
 from lsvision.schema import Text
 from lsvision.stages.correction.config import CorrectionConfig
 from lsvision.stages.correction.uncertainty import drift_per_metre
 from lsvision.stages.disparity.config import DisparityConfig
+from lsvision.types import RefusedVerdict, Verdict
 
 log = logging.getLogger(__name__)
 
@@ -22,7 +24,8 @@ log = logging.getLogger(__name__)
 class CorrectSettings(RunSettings):
     """Options of the experiment; the product is ``<scan's name>.zarr`` in ``output``, the run's folder if None.
 
-    The formats of ``export`` are written beside it.
+    The formats of ``export`` are written beside it. A calibration without a usable n is refused, unless ``accept`` has
+    its verdict.
     """
 
     scan: Text
@@ -30,6 +33,7 @@ class CorrectSettings(RunSettings):
     disparity: DisparityConfig
     correction: CorrectionConfig
     repair_encoder: bool = False
+    accept: list[RefusedVerdict] = field(default_factory=list)
     export: list[ExportFormat] = field(default_factory=list)
     output: Text | None = None
 
@@ -38,8 +42,8 @@ class CorrectSettings(RunSettings):
 class ProductSummary:
     """Size of a product, how much of it was measured, and how far off it may be.
 
-    ``drift_mm_per_m`` is the standard deviation of (q_x, q_y, q_z) per metre of the object, mm, that the calibration's
-    uncertainty causes.
+    ``motion_mm_per_m`` is the sideways and depth motion that was corrected, mm per metre. ``drift_mm_per_m`` is the
+    standard deviation of (q_x, q_y, q_z) per metre of the object, mm, that the calibration's uncertainty causes.
     """
 
     path: str
@@ -49,13 +53,17 @@ class ProductSummary:
     valid_share: float
     lowest_mm: float
     highest_mm: float
+    verdict: Verdict
+    motion_mm_per_m: tuple[float, float]
     drift_mm_per_m: tuple[float, ...]
 
 
 def run_correct(settings: CorrectSettings, folder: Path) -> None:
     """Correct the scan with the calibration's motion and write the product."""
     processing = Processing(settings.disparity, settings.correction, settings.repair_encoder, worker_memory_mb=None)
-    planned = plan_one(settings.scan, settings.calibration, processing)
+    planned = plan_one(settings.scan, settings.calibration, processing, settings.accept)
+    if planned.calibration.warning:
+        log.warning("%s", planned.calibration.warning)
     with progress_bars() as bars:
         summary = make_product(planned, processing, Path(settings.output or folder), bars)
     write_json(folder / "summary.json", asdict(summary))
@@ -64,13 +72,14 @@ def run_correct(settings: CorrectSettings, folder: Path) -> None:
     for name in settings.export:
         for file in export_product(product, name, target.with_suffix("")):
             log.info("wrote %s", file)
-    product_report(product, summary.valid_share, asdict(settings), folder)
+    product_report(product, planned.calibration.calibration, summary.valid_share, asdict(settings), folder)
     log.info(
-        "wrote %s: %d x %d cells of %.3f mm, %.1f %% measured, heights %.1f..%.1f mm, "
-        "drift per metre up to %.3f mm (one sigma)",
+        "wrote %s: %d x %d cells of %.3f mm, %.1f %% measured, heights %.1f..%.1f mm",
         target, summary.rows, summary.columns, summary.pitch_mm, 100 * summary.valid_share,
-        summary.lowest_mm, summary.highest_mm, max(summary.drift_mm_per_m),
+        summary.lowest_mm, summary.highest_mm,
     )  # fmt: skip
+    motion = planned.calibration.calibration.motion
+    log.info("calibration %s, corrected motion %s", summary.verdict, drift_in_words(motion))
 
 
 def make_product(planned: PlannedScan, processing: Processing, output: Path, bars: ProgressBars) -> ProductSummary:
@@ -91,5 +100,7 @@ def make_product(planned: PlannedScan, processing: Processing, output: Path, bar
         valid_share=product.measured.count / (grid.rows * grid.columns),
         lowest_mm=product.measured.lowest_mm,
         highest_mm=product.measured.highest_mm,
+        verdict=planned.calibration.calibration.verdict,
+        motion_mm_per_m=planned.calibration.calibration.motion.drift_mm_per_m,
         drift_mm_per_m=drift_per_metre(planned.calibration.calibration.motion),
     )

@@ -82,7 +82,7 @@ def run_paper(settings: PaperSettings, folder: Path) -> None:
             log.info(
                 "%-9s %-8s RMSE %.4f -> %.4f mm, %.1f %% better, %d iterations, %s",
                 name, method, result.rmse_before_mm, result.rmse_after_mm, 100 * result.improvement,
-                len(result.iterations) - 1, result.observability.verdict,
+                len(result.iterations) - 1, result.verdict,
             )  # fmt: skip
     log.info("wrote %s", folder / "report.html")
 

@@ -3,7 +3,7 @@
 import logging
 import time
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 from lsvision.archive import (
@@ -41,13 +41,17 @@ from lsvision.report.progress import progress_bars
 from lsvision.schema import PositiveInt, Text
 from lsvision.stages.correction.config import CorrectionConfig
 from lsvision.stages.disparity.config import DisparityConfig
+from lsvision.types import RefusedVerdict
 
 log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, kw_only=True)
 class ReprocessSettings(RunSettings):
-    """Options of the experiment; products lie below ``output`` as their scans do below ``archive``."""
+    """Options of the experiment; products lie below ``output`` as their scans do below ``archive``.
+
+    A calibration without a usable n is refused, unless ``accept`` has its verdict.
+    """
 
     archive: Text
     calibration: Text
@@ -58,6 +62,7 @@ class ReprocessSettings(RunSettings):
     dry_run: bool = False
     verify: bool = False
     repair_encoder: bool = False
+    accept: list[RefusedVerdict] = field(default_factory=list)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -127,7 +132,10 @@ def _done_so_far(plan: Plan, ledger: Ledger) -> str:
 
 
 def _plan(settings: ReprocessSettings, output: Path, known: Mapping[str, ScanRow]) -> Plan:
-    calibrations = read_calibrations(settings.calibration)
+    calibrations = read_calibrations(settings.calibration, settings.accept)
+    for calibration in calibrations:
+        if calibration.accepted and calibration.warning:
+            log.warning("%s", calibration.warning)
     found = find_scans(local_archive(settings.archive, output / WORK_FOLDER / "copies"), skip=output)
     if not found:
         raise ConfigError(f"archive: no scans in {settings.archive}")

@@ -43,10 +43,13 @@ def reprocess_report(
             Table("Failed scans", ("scan", "reason"), [(row.scan, row.error) for row in failed]),
             Table(
                 "Scans",
-                ("scan", "status", "lines", "measured [%]", "work [s]", "calibration"),
+                (
+                    "scan", "status", "lines", "measured [%]", "work [s]", "calibration", "verdict",
+                    "sideways [mm/m]", "in depth [mm/m]", "drift, one sigma [mm/m]",
+                ),
                 [
                     (row.scan, row.status, str(row.lines), f"{100 * row.measured_share:.1f}", f"{row.seconds:.1f}",
-                     Path(row.calibration).name)
+                     Path(row.calibration).name, row.verdict, *_drift_columns(row))
                     for row in rows.values()
                 ],
             ),
@@ -55,6 +58,12 @@ def reprocess_report(
         settings=settings,
     )  # fmt: skip
     write_report(page, folder)
+
+
+def _drift_columns(row: ScanRow) -> list[str]:
+    """The corrected motion and its sigma, of a scan whose calibration is known."""
+    values = (row.sideways_mm_per_m, row.in_depth_mm_per_m, row.drift_sigma_mm_per_m)
+    return [f"{value:.3f}" if row.verdict else "" for value in values]
 
 
 def _thumbnails(made: Sequence[ScanRow], output: Path) -> ReportFigure:

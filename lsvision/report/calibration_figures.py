@@ -149,7 +149,7 @@ def observability_bars(calibration: Calibration, *, name: str = "observability",
     axes.set_yticks(range(len(directions)), names)
     axes.set_xscale("log")
     axes.invert_yaxis()
-    label_axes(axes, calibration.observability.verdict, "σ of n along the direction [mm per mm]", "direction of n")
+    label_axes(axes, calibration.verdict, "σ of n along the direction [mm per mm]", "direction of n")
     axes.barh([0], [0], color=AFTER, label="posterior, observed")
     axes.barh([0], [0], color=BEFORE, label="posterior, as wide as the prior")
     figure.legend(loc="outside lower center", ncols=3, fontsize=9)

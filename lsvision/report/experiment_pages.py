@@ -17,6 +17,7 @@ from lsvision.report.pages import Headline, Page, ReportFigure, Table, write_rep
 from lsvision.report.product_figures import product_images
 from lsvision.report.space_figures import corners_in_space, surface_in_space
 from lsvision.report.summary import calibration_summary
+from lsvision.stages.correction.uncertainty import drift_per_metre
 from lsvision.types import BoardCorners, Calibration
 
 _PROVENANCE = ("scan", "calibration", "calibration_sha256", "key")  # of a product's metadata
@@ -28,14 +29,18 @@ def calibration_report(calibration: Calibration, boards: Sequence[BoardCorners],
     motion = calibration.motion
     sigma = motion.sigma.tolist()
     rows = [
-        (Path(fit.scan).name, str(fit.corners), f"{fit.rmse_before_mm:.4f}", f"{fit.rmse_after_mm:.4f}")
+        (
+            Path(fit.scan).name, str(fit.corners), f"{fit.rmse_before_mm:.4f}", f"{fit.rmse_after_mm:.4f}",
+            "" if fit.reduced_chi_square is None else f"{fit.reduced_chi_square:.2f}",
+        )
         for fit in calibration.boards
-    ]
+    ]  # fmt: skip
     curves = {str(calibration.method): calibration}
     page = Page(
         title=f"Calibration from {len(boards)} board scan(s)",
-        lead=calibration_summary(calibration).splitlines()[0] + ". " + calibration.observability.advice,
+        lead=". ".join([calibration_summary(calibration).splitlines()[0], *_explained(calibration)]),
         headlines=[
+            Headline("Verdict", calibration.verdict, "usable" if calibration.usable else "not usable"),
             Headline("RMSE", f"{calibration.rmse_after_mm:.4f} mm", f"before: {calibration.rmse_before_mm:.4f} mm"),
             Headline("Stretch", f"{motion.stretch:.6f}", "true over nominal travel"),
             *(
@@ -43,7 +48,15 @@ def calibration_report(calibration: Calibration, boards: Sequence[BoardCorners],
                 for i, value in enumerate(motion.n.tolist())
             ),
         ],
-        tables=[Table("Boards", ("scan", "corners", "RMSE before [mm]", "RMSE after [mm]"), rows)],
+        tables=[
+            Table(
+                "Boards",
+                ("scan", "corners", "RMSE before [mm]", "RMSE after [mm]", "chi-square per degree of freedom"),
+                rows,
+                "The last column is 1 where the residuals are as large as the corners' stated sigmas; over all boards "
+                f"the noise was scaled by {calibration.noise_scale:.3g}.",
+            )
+        ],
         figures=[
             rmse_by_iteration(curves),
             components_by_iteration(curves),
@@ -64,8 +77,28 @@ def calibration_report(calibration: Calibration, boards: Sequence[BoardCorners],
     write_report(page, folder)
 
 
-def product_report(product: Product, valid_share: float, settings: dict, folder: Path) -> None:
-    """``report.html`` of a product: size, share of valid cells, colour and height of its beginning."""
+def _motion_headlines(calibration: Calibration) -> list[Headline]:
+    """The calibration's verdict, the motion that was corrected and how far positions may drift."""
+    sideways, in_depth = calibration.motion.drift_mm_per_m
+    drift = max(drift_per_metre(calibration.motion))
+    return [
+        Headline("Calibration", calibration.verdict, "; ".join(calibration.reasons) or "n is known in every direction"),
+        Headline("Motion sideways", f"{sideways:+.3f} mm/m", "corrected"),
+        Headline("Motion in depth", f"{in_depth:+.3f} mm/m", "corrected"),
+        Headline("Drift", f"{drift:.3f} mm/m", "one sigma, from the uncertainty of n"),
+    ]
+
+
+def _explained(calibration: Calibration) -> list[str]:
+    """The reasons for the verdict, and the advice where it is not one of them."""
+    advice = calibration.observability.advice
+    return [*calibration.reasons, *([] if advice in calibration.reasons else [advice])]
+
+
+def product_report(
+    product: Product, calibration: Calibration, valid_share: float, settings: dict, folder: Path
+) -> None:
+    """``report.html`` of a product: size, share of valid cells, its motion, colour and height of its beginning."""
     rows = min(product.shape[0], _SHOWN_ROWS)
     height = product.height(0, rows)
     measured = height[torch.isfinite(height)]
@@ -83,6 +116,7 @@ def product_report(product: Product, valid_share: float, settings: dict, folder:
             Headline("Size", f"{product.shape[0]} x {product.shape[1]} cells", f"of {product.pitch_mm:.4f} mm"),
             Headline("Measured", f"{100 * valid_share:.1f} %", "of all cells"),
             Headline("Heights", span, f"first {rows} rows"),
+            *_motion_headlines(calibration),
         ],
         figures=figures,
         settings=settings,

@@ -111,7 +111,7 @@ def methods_table(scenarios: Mapping[str, Scenario]) -> Table:
                     f"{result.motion.stretch:.5f}",
                     "  ".join(f"{value:+.1e}" for value in error),
                     "  ".join(f"{value:.1e}" for value in result.motion.sigma.tolist()),
-                    result.observability.verdict,
+                    result.verdict,
                 )
             )
     header = (

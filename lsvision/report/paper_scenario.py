@@ -92,5 +92,6 @@ class Scenario:
             "n": result.motion.n.tolist(),
             "n_true": self.n_true.tolist(),
             "sigma": result.motion.sigma.tolist(),
-            "verdict": result.observability.verdict,
+            "verdict": result.verdict,
+            "noise_scale": result.noise_scale,
         }

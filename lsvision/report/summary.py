@@ -2,7 +2,7 @@
 
 import math
 
-from lsvision.types import Calibration
+from lsvision.types import Calibration, Motion
 
 
 def calibration_summary(calibration: Calibration) -> str:
@@ -13,12 +13,15 @@ def calibration_summary(calibration: Calibration) -> str:
     corners = sum(board.corners for board in calibration.boards)
     lines = [
         f"{calibration.method.replace('_', '-')} calibration of {len(calibration.boards)} board scan(s), "
-        f"{corners} corners: {observability.verdict}" + ("" if calibration.converged else ", NOT CONVERGED"),
+        f"{corners} corners: {calibration.verdict if calibration.usable else calibration.verdict.upper()}",
         f"  motion n     {_vector(n)}  ± {_vector(sigma, '.1e')}",
         f"  stretch      {motion.stretch:.6f}, turned {angle_x:+.4f}° sideways and {angle_z:+.4f}° in depth",
         f"  RMSE         {calibration.rmse_before_mm:.4f} -> {calibration.rmse_after_mm:.4f} mm "
         f"({100 * calibration.improvement:.1f} % better)",
+        f"  noise        {math.sqrt(calibration.noise_scale):.2g} times the corners' stated sigmas",
+        f"  drift        {drift_in_words(motion)}",
     ]
+    lines += [f"  because      {reason}" for reason in calibration.reasons if reason != observability.advice]
     unknown = [direction for direction in observability.directions if not direction.observed]
     lines += [
         f"  not measured {_vector(direction.vector, '+.2f')}: σ stays at {direction.posterior_sigma:.1e} "
@@ -28,6 +31,15 @@ def calibration_summary(calibration: Calibration) -> str:
     if observability.advice:
         lines.append(f"  next         {observability.advice}")
     return "\n".join(lines)
+
+
+def drift_in_words(motion: Motion) -> str:
+    """How far the object moves off the nominal direction per metre, with its sigma."""
+    sigma = (1000.0 / motion.n[1] * motion.sigma).tolist()
+    return ", ".join(
+        f"{value:+.3f} ± {sigma[axis]:.2g} mm per metre {where}"
+        for value, axis, where in zip(motion.drift_mm_per_m, (0, 2), ("sideways", "in depth"), strict=True)
+    )
 
 
 def _vector(values: list[float] | tuple[float, float, float], spec: str = "+.6f") -> str:

@@ -59,7 +59,7 @@ def make_scan(folder: Path, lines: int = 96, seed: int = 0, *, stereo: bool = Fa
 def make_calibration(path: Path, n: Sequence[float] = (0.02, 1.02, -0.01), rig: Rig = RIG) -> Path:
     """A calibration that says nothing but its motion."""
     motion = Motion(torch.tensor(n, dtype=torch.float64), 1e-8 * torch.eye(3, dtype=torch.float64))
-    write_calibration(Calibration("joint", motion, 1.0, 0.1, (), (), Observability("determined", (), ""), rig), path)
+    write_calibration(Calibration("joint", motion, 1.0, 0.1, (), (), Observability((), ""), rig), path)
     return path
 
 

@@ -84,8 +84,11 @@ def test_a_ledger_in_words():
     rows = {
         "a": ScanRow("a", "/a", "done", lines=7, measured_share=0.5),
         "bb": ScanRow("bb", "/bb", "failed", error="why"),
+        "c": ScanRow("c", "/c", "done", lines=7, verdict="prior-dominated", drift_sigma_mm_per_m=48.8),
     }
-    assert list(ledger_lines(rows)) == [
+    lines = list(ledger_lines(rows))
+    assert lines.pop() == "c   done          0.0 s  prior-dominated to ±49 mm/m, 7 lines, 0.0 % measured"
+    assert lines == [
         "a   done          0.0 s  7 lines, 50.0 % measured",
         "bb  failed        0.0 s  why",
     ]
@@ -102,6 +105,23 @@ def test_a_ledger_of_an_earlier_version_starts_anew(tmp_path, caplog):
     assert "of an earlier version and starts anew" in caplog.text
     with Ledger(tmp_path / "ledger.sqlite") as ledger:
         assert list(ledger.scans()) == ["b"]
+
+
+def test_a_ledger_of_version_2_keeps_its_rows_and_gets_the_new_columns(tmp_path, caplog):
+    path, row = tmp_path / "ledger.sqlite", ScanRow("a", "/a", "done", lines=7, version="v")
+    with Ledger(path) as ledger:
+        ledger.put_scan(row)
+    with sqlite3.connect(path) as db:
+        for column in ("verdict", "sideways_mm_per_m", "in_depth_mm_per_m", "drift_sigma_mm_per_m"):
+            db.execute(f"ALTER TABLE scans DROP COLUMN {column}")
+        db.execute("PRAGMA user_version = 2")
+    db.close()
+    with Ledger(path) as ledger:
+        assert ledger.scans() == {"a": row}
+        known = replace(row, verdict="determined", sideways_mm_per_m=-25.0, drift_sigma_mm_per_m=0.3)
+        ledger.put_scan(known)
+        assert ledger.scan("a") == known
+    assert not caplog.text
 
 
 def test_a_ledger_of_a_later_version_is_refused(tmp_path):

@@ -3,6 +3,7 @@
 import errno
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import laspy
@@ -12,6 +13,7 @@ import tifffile
 import torch
 import zarr.storage._local
 
+from lsvision.archive import Ledger
 from lsvision.io import NewScan, read_calibration, read_product, read_scan, write_calibration, write_encoder, write_scan
 from lsvision.simulation import Acquisition, SceneConfig, SensorConfig, Simulation, simulate
 from lsvision.types import Calibration, Motion, Observability
@@ -24,7 +26,7 @@ def calibration_of(simulation: Simulation) -> Calibration:
     """The true motion with a covariance."""
     covariance = torch.diag(torch.tensor(SIGMA, dtype=torch.float64).square())
     motion = Motion(simulation.trajectory.n, covariance)
-    return Calibration("joint", motion, 1.0, 0.1, (), (), Observability("determined", (), ""), simulation.rig)
+    return Calibration("joint", motion, 1.0, 0.1, (), (), Observability((), ""), simulation.rig)
 
 
 @pytest.fixture(scope="module")
@@ -167,3 +169,50 @@ def test_a_full_disk_during_an_export_keeps_the_product(made, command, tmp_path,
     assert not list((tmp_path / "run").glob("*.laz"))
     assert not list((tmp_path / "run").glob(".*partial"))
     assert read_product(tmp_path / "run" / "scan.zarr").shape[0] > 0
+
+
+@pytest.fixture
+def unusable(made: Path, tmp_path: Path) -> Path:
+    """A calibration that did not converge."""
+    calibration = replace(
+        read_calibration(made / "calibration.json"), verdict="not converged", reasons=("it had not settled",)
+    )
+    write_calibration(calibration, tmp_path / "unusable.json")
+    return tmp_path / "unusable.json"
+
+
+def test_a_calibration_without_a_usable_n_corrects_only_where_it_is_accepted(made, unusable, command, tmp_path, capsys):
+    asked = (*correct(made), f"calibration={unusable}")
+    assert command(*asked) == 1
+    assert capsys.readouterr().err.splitlines() == [
+        f"error: {unusable}: the calibration is not converged: it had not settled"
+    ]
+    assert not (tmp_path / "run" / "scan.zarr").exists()
+    assert command(*asked, "accept=[inconsistent]", folder="other") == 1
+    assert command(*asked, "accept=[not_converged]", folder="accepted") == 0
+    said = capsys.readouterr().out
+    assert "the calibration is not converged: it had not settled" in said
+    assert "mm per metre sideways" in said
+    metadata = read_product(tmp_path / "accepted" / "scan.zarr").metadata
+    n1, n2, n3 = metadata["n"]
+    assert metadata["calibration_verdict"] == "not converged"
+    assert metadata["calibration_reasons"] == ["it had not settled"]
+    assert metadata["motion_mm_per_m"] == pytest.approx({"sideways": 1000 * n1 / n2, "in_depth": 1000 * n3 / n2})
+    assert max(metadata["drift_sigma_mm_per_m"]) == pytest.approx(0.3, rel=0.1)
+    summary = json.loads((tmp_path / "accepted" / "summary.json").read_text())
+    assert summary["verdict"] == "not converged"
+
+
+def test_reprocess_refuses_it_too_and_records_the_verdict_of_what_it_uses(made, unusable, command, tmp_path):
+    shutil.copytree(made / "scan", tmp_path / "archive" / "scan")
+    asked = (
+        "+experiment=reprocess", f"archive={tmp_path / 'archive'}", f"calibration={unusable}",
+        f"output={tmp_path / 'products'}", "engine.workers=1", "correction.height_range_mm=[-30,30]",
+    )  # fmt: skip
+    assert command(*asked) == 1
+    assert command(*asked, "accept=[not_converged]", folder="accepted") == 0
+    with Ledger(tmp_path / "products" / "ledger.sqlite") as ledger:
+        row = ledger.scans()["scan"]
+    assert row.verdict == "not converged"
+    assert row.drift_sigma_mm_per_m == pytest.approx(0.3, rel=0.1)
+    assert "not converged" in (tmp_path / "accepted" / "report.html").read_text(encoding="utf-8")

@@ -62,6 +62,7 @@ def calibration(small_rig: Rig) -> Calibration:
         pose=Pose(torch.eye(3).double(), torch.tensor([1.0, 2.0, 797.3], dtype=torch.float64)),
         rmse_before_mm=2.1,
         rmse_after_mm=0.05,
+        reduced_chi_square=1.5,
     )
     direction = ObservedDirection((0.0, 0.6, 0.8), 0.05, 2.5e-5, True)
     return Calibration(
@@ -71,7 +72,10 @@ def calibration(small_rig: Rig) -> Calibration:
         rmse_after_mm=0.8794,
         iterations=(Iteration(2.059, (0.0, 1.0, 0.0), 1.0), Iteration(1 / 3, (-0.02, 0.98, 0.3), 1.02)),
         boards=(board,),
-        observability=Observability("determined", (direction,), "tilt the board by 15° about the sensor axis"),
+        observability=Observability((direction,), "tilt the board by 15° about the sensor axis"),
         rig=small_rig,
+        verdict="inconsistent",
+        reasons=("scan b ran 3.0 % faster than a",),
+        noise_scale=2.5,
         provenance=Provenance("0.1.0", "ab" * 32, (("scans/a", "cd" * 32),)),
     )

@@ -53,7 +53,7 @@ def determined() -> Calibration:
         rmse_after_mm=0.5,
         iterations=(Iteration(2.0, (0.0, 1.0, 0.0), 1.0), Iteration(0.5, (-0.026, 1.02, 0.014), 1.0204)),
         boards=(fit, dataclasses.replace(fit, scan="scans/second")),
-        observability=Observability("determined", observed, "n is determined"),
+        observability=Observability(observed, "n is determined"),
         rig=Rig(447, 160.0, 113.84, 354.0, 64.6, 380.7),
     )
 
@@ -65,6 +65,8 @@ def dominated(determined: Calibration) -> Calibration:
     return dataclasses.replace(
         determined,
         method="two_step",
-        observability=Observability("prior-dominated", seen, advice),
+        observability=Observability(seen, advice),
+        verdict="not converged",
+        reasons=("the estimate had not settled after 20 iterations", advice),
         converged=False,
     )

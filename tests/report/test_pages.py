@@ -114,16 +114,18 @@ def test_calibration_report(tmp_path, determined, corners):
 
 
 @pytest.mark.parametrize("measured", [True, False])
-def test_product_report(tmp_path, measured):
+def test_product_report(tmp_path, measured, dominated):
     height = torch.full((20, 30), 2.5) if measured else torch.full((20, 30), torch.nan)
     target = tmp_path / "scan.zarr"
     layout = ProductLayout(ProductGrid(20, 30, 0.5, 1.0, 2.0), 3, torch.uint8, chunk_rows=20, metadata={"scan": NASTY})
     with product_writer(target, layout) as writer:
         color = torch.randint(0, 256, (20, 30, 3)).to(torch.uint8)
         writer.write(ProductStrip(0, color, height, height.isfinite(), torch.zeros(20, 30, 2)))
-    product_report(read_product(target), 0.5, {"pitch": 0.5}, tmp_path)
+    product_report(read_product(target), dominated, 0.5, {"pitch": 0.5}, tmp_path)
     page = read_page(tmp_path)
     assert NASTY in page.text
     assert "20 x 30 cells" in page.text
     assert "50.0 %" in page.text
+    assert "not converged" in page.text
+    assert "-25.490 mm/m" in page.text
     assert ("2.50 .. 2.50 mm" if measured else "nothing measured") in page.text

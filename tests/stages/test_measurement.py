@@ -73,7 +73,7 @@ def test_chain_on_another_renderer(shared_data: Path):
     error = (calibration.motion.n - true_motion(scans[0])).abs()
     assert (error <= torch.tensor([5e-5, 5e-5, 4e-4])).all()
     assert calibration.rmse_after_mm <= 0.04
-    assert calibration.observability.verdict == "determined"
+    assert calibration.verdict == "determined"
     scan = scans[1]
     wide = DisparityConfig(height_range_mm=(-60.0, 60.0))
     corrected, nominal = measured(scan, calibration.motion, wide), measured(scan, NOMINAL, wide)

@@ -2,18 +2,18 @@
 
 import hashlib
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import date
 from pathlib import Path
 from typing import Annotated
 
 from pydantic import BeforeValidator
 
-from lsvision.errors import CalibrationError, FileFormatError
+from lsvision.errors import CalibrationError, FileFormatError, UnusableCalibrationError
 from lsvision.io import check_rig_match, read_calibration
 from lsvision.io.formats.validation import named_file, read_entries, read_yaml
 from lsvision.schema import Checked, Says, Text
-from lsvision.types import Calibration, Scan
+from lsvision.types import Calibration, RefusedVerdict, Scan
 
 LIST_FILE = "calibrations.yaml"
 
@@ -41,29 +41,59 @@ class ListedCalibration(Checked):
 
 @dataclass(frozen=True)
 class DatedCalibration:
-    """A calibration, the hash of its file, and its first and last day; None where it has none."""
+    """A calibration, the hash of its file, and its first and last day; None where it has none.
+
+    ``accepted`` says whether it may correct scans: its n is usable, or the caller accepts its verdict.
+    """
 
     path: Path
     calibration: Calibration
     sha256: str
     first: date | None = None
     last: date | None = None
+    accepted: bool = True
 
     def holds_on(self, day: date) -> bool:
         """Whether a day lies within its days."""
         return (self.first is None or self.first <= day) and (self.last is None or day <= self.last)
 
+    def check_accepted(self) -> None:
+        """Raise UnusableCalibrationError where it may not correct scans."""
+        if not self.accepted:
+            raise UnusableCalibrationError(str(self.path), self.calibration.verdict, self.calibration.reasons)
 
-def read_calibrations(path: Path | str) -> list[DatedCalibration]:
+    @property
+    def warning(self) -> str | None:
+        """The sentence on what to beware of in its products; None where n is determined."""
+        verdict, why = self.calibration.verdict, "; ".join(self.calibration.reasons)
+        return None if verdict == "determined" else f"{self.path}: the calibration is {verdict}: {why}"
+
+
+def read_calibrations(path: Path | str, accept: Sequence[RefusedVerdict] = ()) -> list[DatedCalibration]:
     """Read one calibration, or a folder of them.
 
     A folder holds ``calibrations.yaml``, a list of ``{file: NAME, from: DAY, to: DAY}`` with either day optional, or
     simply one calibration a rig as ``*.json``.
 
+    Args:
+        accept: verdicts without a usable n whose calibrations are used all the same.
+
     Raises:
         FileFormatError: a file is missing or damaged, or a folder holds none.
+        UnusableCalibrationError: the one calibration has no usable n. One of a folder is refused by
+            ``calibration_for``, to the scans that need it.
     """
-    path = Path(path)
+    found = [replace(item, accepted=_is_accepted(item.calibration, accept)) for item in _read_all(Path(path))]
+    if len(found) == 1:
+        found[0].check_accepted()
+    return found
+
+
+def _is_accepted(calibration: Calibration, accept: Sequence[RefusedVerdict]) -> bool:
+    return calibration.usable or calibration.verdict.replace(" ", "_") in accept
+
+
+def _read_all(path: Path) -> list[DatedCalibration]:
     if not path.is_dir():
         return [_read(path)]
     if (path / LIST_FILE).is_file():
@@ -83,8 +113,14 @@ def calibration_for(scan: Scan, calibrations: Sequence[DatedCalibration]) -> Dat
     The day is the scan's attribute ``date``, as 2024-05-31 or with a time behind it.
 
     Raises:
-        CalibrationError: none fits, or more than one does.
+        CalibrationError: none fits, more than one does, or the one that fits has no usable n and was not accepted.
     """
+    chosen = _fitting(scan, calibrations)
+    chosen.check_accepted()
+    return chosen
+
+
+def _fitting(scan: Scan, calibrations: Sequence[DatedCalibration]) -> DatedCalibration:
     if len(calibrations) == 1 and calibrations[0].first is None and calibrations[0].last is None:
         check_rig_match(calibrations[0].calibration, scan)
         return calibrations[0]

@@ -1,7 +1,7 @@
 """The calibration file: ``calibration.json``."""
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Literal
 
@@ -12,7 +12,7 @@ from lsvision.errors import CalibrationError, FileFormatError
 from lsvision.io.formats.rig import RigEntries, rig_to_dict
 from lsvision.io.formats.validation import Matrix, Triple, read_entries, read_json
 from lsvision.io.json_file import write_json
-from lsvision.schema import Checked, NonNegative, PositiveInt, Text
+from lsvision.schema import Checked, NonNegative, Positive, PositiveInt, Text
 from lsvision.types import (
     BoardFit,
     Calibration,
@@ -20,9 +20,11 @@ from lsvision.types import (
     Iteration,
     Motion,
     Observability,
+    ObservedDirection,
     Pose,
     Provenance,
     Scan,
+    Verdict,
 )
 
 CalibrationFormat = Literal["lsvision-calibration/1"]
@@ -69,6 +71,7 @@ class BoardEntries(Checked):
     translation_mm: Triple
     rmse_before_mm: NonNegative
     rmse_after_mm: NonNegative
+    reduced_chi_square: NonNegative | None = None
 
     def fit(self) -> BoardFit:
         """The board's fit."""
@@ -78,7 +81,17 @@ class BoardEntries(Checked):
             pose=Pose(_float64(self.rotation), _float64(self.translation_mm)),
             rmse_before_mm=self.rmse_before_mm,
             rmse_after_mm=self.rmse_after_mm,
+            reduced_chi_square=self.reduced_chi_square,
         )
+
+
+@dataclass(frozen=True)
+class ObservabilityEntries(Checked):
+    """Entry ``observability``; its verdict follows from the directions and is accepted as it is."""
+
+    directions: tuple[ObservedDirection, ...]
+    advice: str
+    verdict: object = None
 
 
 @dataclass(frozen=True)
@@ -100,7 +113,10 @@ class ProvenanceEntries(Checked):
 
 @dataclass(frozen=True)
 class CalibrationEntries(Checked):
-    """The entries of ``calibration.json``; the improvement follows from the two RMSE and is accepted as it is."""
+    """The entries of ``calibration.json``; the improvement follows from the two RMSE and is accepted as it is.
+
+    Files of earlier versions lack ``verdict``, ``reasons`` and ``noise_scale``.
+    """
 
     format: CalibrationFormat
     method: CalibrationMethod
@@ -109,9 +125,12 @@ class CalibrationEntries(Checked):
     rmse_after_mm: NonNegative
     iterations: tuple[Iteration, ...]
     boards: list[BoardEntries]
-    observability: Observability
+    observability: ObservabilityEntries
     rig: RigEntries
     provenance: ProvenanceEntries
+    verdict: Verdict | None = None
+    reasons: tuple[str, ...] = ()
+    noise_scale: Positive = 1.0
     converged: bool | None = None
     improvement: object = None
 
@@ -126,26 +145,19 @@ def write_calibration(calibration: Calibration, path: Path | str) -> None:
     data = {
         "format": CALIBRATION_FORMAT,
         "method": calibration.method,
+        "verdict": calibration.verdict,
+        "reasons": list(calibration.reasons),
         "converged": calibration.converged,
+        "noise_scale": calibration.noise_scale,
         "motion": _motion_to_dict(calibration.motion),
         "rmse_before_mm": calibration.rmse_before_mm,
         "rmse_after_mm": calibration.rmse_after_mm,
         "improvement": calibration.improvement,
-        "iterations": [
-            {"rmse_mm": item.rmse_mm, "n": list(item.n), "stretch": item.stretch} for item in calibration.iterations
-        ],
+        "iterations": [asdict(item) for item in calibration.iterations],
         "boards": [_board_to_dict(board) for board in calibration.boards],
         "observability": {
-            "verdict": observability.verdict,
-            "directions": [
-                {
-                    "vector": list(item.vector),
-                    "prior_sigma": item.prior_sigma,
-                    "posterior_sigma": item.posterior_sigma,
-                    "observed": item.observed,
-                }
-                for item in observability.directions
-            ],
+            "verdict": "determined" if observability.determined else "prior-dominated",
+            "directions": [asdict(item) for item in observability.directions],
             "advice": observability.advice,
         },
         "rig": rig_to_dict(calibration.rig),
@@ -166,15 +178,20 @@ def read_calibration(path: Path | str) -> Calibration:
     """
     path = Path(path)
     entries = read_entries(CalibrationEntries, read_json(path), path)
+    observability = Observability(entries.observability.directions, entries.observability.advice)
+    converged = entries.converged is not False
     return Calibration(
         method=entries.method,
-        converged=entries.converged is not False,
+        verdict=entries.verdict or _verdict_of_earlier_file(converged, observability),
+        reasons=entries.reasons,
+        converged=converged,
+        noise_scale=entries.noise_scale,
         motion=entries.motion.motion(path),
         rmse_before_mm=entries.rmse_before_mm,
         rmse_after_mm=entries.rmse_after_mm,
         iterations=entries.iterations,
         boards=tuple(board.fit() for board in entries.boards),
-        observability=entries.observability,
+        observability=observability,
         rig=entries.rig.rig(),
         provenance=Provenance(
             version=entries.provenance.version,
@@ -217,7 +234,14 @@ def _board_to_dict(board: BoardFit) -> dict[str, object]:
         "translation_mm": board.pose.translation.double().tolist(),
         "rmse_before_mm": board.rmse_before_mm,
         "rmse_after_mm": board.rmse_after_mm,
+        "reduced_chi_square": board.reduced_chi_square,
     }
+
+
+def _verdict_of_earlier_file(converged: bool, observability: Observability) -> Verdict:
+    if not converged:
+        return "not converged"
+    return "determined" if observability.determined else "prior-dominated"
 
 
 def _float64(numbers: Triple | Matrix) -> Tensor:

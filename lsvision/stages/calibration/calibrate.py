@@ -11,18 +11,16 @@ from torch import Tensor
 from lsvision.errors import CalibrationError, ConfigError
 from lsvision.estimation import Info, Posterior
 from lsvision.stages.calibration.config import CalibrationConfig
-from lsvision.stages.calibration.linearise import linearise
 from lsvision.stages.calibration.measurements import BoardMeasurements, SoundProblem
 from lsvision.stages.calibration.methods import estimate
 from lsvision.stages.calibration.model import rotations, squared_residuals, translations
+from lsvision.stages.calibration.noise import board_chi_square, noise_scale
 from lsvision.stages.calibration.observability import observe
 from lsvision.stages.calibration.problem import BoardProblem, MountingPitch
+from lsvision.stages.calibration.verdict import judge, not_settled, rmse_grew
 from lsvision.types import BoardCorners, BoardFit, Calibration, Iteration, Motion, Pose, Rig
 
 __all__ = ["BatchCalibration", "CalibrationConfig", "calibrate", "calibrate_batch"]
-
-# The noise is scaled up where the given covariance would leave residuals as large with less than this probability.
-_NOISE_TEST_LEVEL = 1e-3
 
 
 @dataclass(frozen=True)
@@ -68,22 +66,28 @@ def calibrate(boards: Sequence[BoardCorners], rig: Rig, config: CalibrationConfi
             if bad:
                 raise CalibrationError(f"{board.scan}: {flaw.value}")
     solution = _solve(measured, config)
-    batch, noise_scale = solution.summary(), float(solution.noise_scale)
+    batch, scale = solution.summary(), float(solution.noise_scale)
     if int(batch.info) == Info.SINGULAR:
         raise CalibrationError(
             f"{', '.join(board.scan for board in boards)}: the corners do not determine the boards' poses"
         )
+    observability = observe(solution.problem, solution.posterior.mean, config.prior_sigma, scale)
+    iterations, converged = _iterations(batch), bool(batch.converged)
+    contradictions = rmse_grew(iterations[0].rmse_mm, iterations[-1].rmse_mm)
+    judged = judge(not_settled(converged, int(batch.iterations)), contradictions, observability)
     return Calibration(
         method=config.method,
         motion=Motion(batch.n, batch.covariance),
-        rmse_before_mm=float(batch.rmse_path_mm[0]),
-        rmse_after_mm=float(batch.rmse_path_mm[-1]),
-        iterations=_iterations(batch),
-        boards=_board_fits(boards, batch),
-        observability=observe(solution.problem, solution.posterior.mean, config.prior_sigma, noise_scale),
+        rmse_before_mm=iterations[0].rmse_mm,
+        rmse_after_mm=iterations[-1].rmse_mm,
+        iterations=iterations,
+        boards=_board_fits(boards, batch, board_chi_square(solution.problem, solution.posterior)),
+        observability=observability,
         rig=rig,
-        converged=bool(batch.converged),
-        noise_scale=noise_scale,
+        verdict=judged.verdict,
+        reasons=judged.reasons,
+        converged=converged,
+        noise_scale=scale,
     )
 
 
@@ -150,7 +154,7 @@ def _solve(measured: BoardMeasurements, config: CalibrationConfig) -> _Solution:
     problem, start = posed.problem, posed.start
     posterior = estimate(problem, start, config)
     drifting = config.method == "sequential" and bool(config.process_sigma)  # residuals of one n are then no noise
-    scale = torch.ones_like(start[..., 0]) if drifting else _noise_scale(problem, posterior)
+    scale = torch.ones_like(start[..., 0]) if drifting else noise_scale(problem, posterior)
     if bool((scale > 1).any()):
         noisier = replace(problem, noise_chol=problem.noise_chol * scale.sqrt()[..., None, None, None, None])
         posterior = _merge(scale > 1, estimate(noisier, start, config), posterior)
@@ -168,20 +172,6 @@ def _mounting_pitch(config: CalibrationConfig) -> MountingPitch | None:
     if config.mounting_pitch_deg is None:
         return None
     return MountingPitch(math.radians(config.mounting_pitch_deg), math.radians(config.mounting_pitch_sigma_deg))
-
-
-def _noise_scale(problem: BoardProblem, posterior: Posterior) -> Tensor:
-    """Reduced chi-square of the residuals where they are larger than chance allows, else 1.
-
-    They are weighed with the linearisation's error as well: where only the prior determines n, the mean of the
-    posterior does not lie on the curve of poses and n that fit.
-    """
-    corners_alone = problem if problem.pitch is None else replace(problem, pitch=None)
-    rows = linearise(corners_alone, posterior.mean, posterior.factor)
-    squared = rows.matrix[..., -1].square().sum(-1)
-    freedom = 3.0 * problem.valid.sum((-2, -1)) - posterior.mean.shape[-1]
-    unlikely = torch.special.gammaincc(freedom / 2, squared / 2) < _NOISE_TEST_LEVEL
-    return torch.where(unlikely, squared / freedom, 1.0)
 
 
 def _merge(chosen: Tensor, one: Posterior, other: Posterior) -> Posterior:
@@ -210,7 +200,7 @@ def _iterations(batch: BatchCalibration) -> tuple[Iteration, ...]:
     )
 
 
-def _board_fits(boards: Sequence[BoardCorners], batch: BatchCalibration) -> tuple[BoardFit, ...]:
+def _board_fits(boards: Sequence[BoardCorners], batch: BatchCalibration, chi_square: Tensor) -> tuple[BoardFit, ...]:
     return tuple(
         BoardFit(
             scan=board.scan,
@@ -218,6 +208,7 @@ def _board_fits(boards: Sequence[BoardCorners], batch: BatchCalibration) -> tupl
             pose=Pose(batch.rotation[i], batch.translation_mm[i]),
             rmse_before_mm=float(batch.board_rmse_before_mm[i]),
             rmse_after_mm=float(batch.board_rmse_after_mm[i]),
+            reduced_chi_square=float(chi_square[i]),
         )
         for i, board in enumerate(boards)
     )

@@ -30,7 +30,7 @@ _AXES = ("n1 (sideways)", "n2 (stretch)", "n3 (in depth)")
 def observe(
     problem: BoardProblem, state: Float[Tensor, " state"], prior_sigma: float, noise_scale: float
 ) -> Observability:
-    """Verdict, direction by direction, on one problem at its solution, and the tilt to scan next in words.
+    """What the boards of one problem show of n, direction by direction, and what to scan next, in words.
 
     Args:
         state: solution of the problem, whose batch shape is ().
@@ -48,9 +48,9 @@ def observe(
     proposal = _tilt_in_words(about_x, about_y)
     if not missing:
         weakest = _direction_in_words(directions[0])
-        return Observability("determined", directions, f"n is determined; to sharpen {weakest}, {proposal}")
+        return Observability(directions, f"n is determined; to sharpen {weakest}, {proposal}")
     names = ", ".join(_direction_in_words(direction) for direction in missing)
-    return Observability("prior-dominated", directions, f"the boards do not show {names}: {proposal}")
+    return Observability(directions, f"the boards do not show {names}: {proposal}")
 
 
 def next_tilt(

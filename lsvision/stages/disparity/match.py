@@ -77,7 +77,7 @@ def _gray(image: Tensor, white: float) -> Tensor:
 
 
 def _measure(left: Tensor, right: Tensor, unusable: UnusableSamples, rig: Rig, config: DisparityConfig) -> StripMatch:
-    """Disparity and sigma of a pair of grey images: search, then then refinement."""
+    """Disparity and sigma of a pair of grey images: search, then refinement."""
     # In noise alone every pixel would find a match somewhere.
     if any(float(image[::_BLANK_TEST_STEP].float().std()) <= config.refine_noise for image in (left, right)):
         return StripMatch(torch.full(left.shape, torch.nan), torch.full(left.shape, torch.nan))
@@ -91,7 +91,8 @@ def _measure(left: Tensor, right: Tensor, unusable: UnusableSamples, rig: Rig, c
         window=config.refine_window,
         iterations=config.refine_iterations,
         noise=config.refine_noise,
-        largest_sigma_px=config.largest_sigma_px,
+        largest_sigma_px=config.largest_sigma_px or math.inf,
+        with_gain=config.matcher == "sgbm",
     )
     refined = refine_disparity(left, right, disparity, options)
     return StripMatch(refined.disparity, refined.sigma)

@@ -7,7 +7,8 @@ import pytest
 import torch
 
 from lsvision.archive import calibration_for, read_calibrations
-from lsvision.errors import CalibrationError, FileFormatError
+from lsvision.errors import CalibrationError, FileFormatError, UnusableCalibrationError
+from lsvision.io import read_calibration, write_calibration
 from lsvision.types import DepthView, Scan, TensorImage, Travel
 from tests.archive.archives import RIG, make_calibration
 
@@ -100,3 +101,34 @@ def test_lists_with_faults(dated, text, message):
 def test_a_folder_without_any(tmp_path):
     with pytest.raises(FileFormatError, match=r"expected calibrations.yaml or calibrations as \*.json"):
         read_calibrations(tmp_path)
+
+
+def spoilt(path, verdict):
+    """The calibration at a path with another verdict."""
+    calibration = dataclasses.replace(read_calibration(path), verdict=verdict, reasons=("it does not fit",))
+    write_calibration(calibration, path)
+    return path
+
+
+@pytest.mark.parametrize("verdict", ["inconsistent", "not converged"])
+def test_a_calibration_without_a_usable_n_is_refused_unless_its_verdict_is_accepted(tmp_path, verdict):
+    file = spoilt(make_calibration(tmp_path / "a.json"), verdict)
+    with pytest.raises(UnusableCalibrationError, match=rf"a\.json: the calibration is {verdict}: it does not fit"):
+        read_calibrations(file)
+    (found,) = read_calibrations(file, [verdict.replace(" ", "_")])
+    assert found.accepted
+    assert found.warning == f"{file}: the calibration is {verdict}: it does not fit"
+
+
+def test_a_refused_calibration_of_a_folder_is_refused_to_its_scans_alone(dated):
+    spoilt(dated / "spring.json", "inconsistent")
+    calibrations = read_calibrations(dated)
+    assert calibration_for(scan_of(date="2024-07-01"), calibrations).warning is None
+    with pytest.raises(UnusableCalibrationError, match=r"spring\.json"):
+        calibration_for(scan_of(date="2024-05-01"), calibrations)
+
+
+def test_a_prior_dominated_calibration_is_used_with_a_warning(tmp_path):
+    (found,) = read_calibrations(spoilt(make_calibration(tmp_path / "a.json"), "prior-dominated"))
+    assert found.accepted
+    assert "prior-dominated" in found.warning

@@ -46,7 +46,18 @@ def test_file_has_the_documented_keys(tmp_path: Path, calibration: Calibration) 
     write_calibration(replace(calibration, motion=motion), tmp_path / "calibration.json")
     data = json.loads((tmp_path / "calibration.json").read_text())
     assert list(data) == [
-        *("format", "method", "converged", "motion", "rmse_before_mm", "rmse_after_mm", "improvement"),
+        *(
+            "format",
+            "method",
+            "verdict",
+            "reasons",
+            "converged",
+            "noise_scale",
+            "motion",
+            "rmse_before_mm",
+            "rmse_after_mm",
+            "improvement",
+        ),
         *("iterations", "boards", "observability", "rig", "provenance"),
     ]
     assert list(data["motion"]) == ["n", "stretch", "angles_deg", "covariance", "sigma"]
@@ -56,7 +67,7 @@ def test_file_has_the_documented_keys(tmp_path: Path, calibration: Calibration) 
     assert data["improvement"] == pytest.approx(1 - 0.8794 / 2.059)
     assert list(data["iterations"][0]) == ["rmse_mm", "n", "stretch"]
     assert list(data["boards"][0]) == [
-        *("scan", "corners", "rotation", "translation_mm", "rmse_before_mm", "rmse_after_mm")
+        *("scan", "corners", "rotation", "translation_mm", "rmse_before_mm", "rmse_after_mm", "reduced_chi_square")
     ]
     assert list(data["observability"]) == ["verdict", "directions", "advice"]
     assert list(data["observability"]["directions"][0]) == ["vector", "prior_sigma", "posterior_sigma", "observed"]
@@ -70,9 +81,36 @@ def test_what_follows_from_n_may_be_left_out(tmp_path: Path, calibration: Calibr
     data = json.loads(file.read_text())
     for key in ("stretch", "angles_deg", "sigma"):
         del data["motion"][key]
-    del data["improvement"], data["converged"]
+    del data["improvement"], data["observability"]["verdict"]
     file.write_text(json.dumps(data))
     assert plain(read_calibration(file)) == plain(calibration)
+
+
+@pytest.mark.parametrize(
+    ("converged", "observed", "verdict"),
+    [
+        (True, True, "determined"),
+        (None, True, "determined"),
+        (None, False, "prior-dominated"),
+        (False, True, "not converged"),
+    ],
+)
+def test_files_of_earlier_versions_get_the_verdict_that_they_imply(
+    tmp_path: Path, calibration: Calibration, converged: bool | None, observed: bool, verdict: str
+) -> None:
+    file = tmp_path / "calibration.json"
+    write_calibration(calibration, file)
+    data = json.loads(file.read_text())
+    del data["verdict"], data["reasons"], data["noise_scale"], data["boards"][0]["reduced_chi_square"]
+    del data["converged"]
+    if converged is not None:
+        data["converged"] = converged
+    data["observability"]["directions"][0]["observed"] = observed
+    file.write_text(json.dumps(data))
+    found = read_calibration(file)
+    assert (found.verdict, found.reasons, found.noise_scale) == (verdict, (), 1.0)
+    assert found.boards[0].reduced_chi_square is None
+    assert found.usable == (verdict != "not converged")
 
 
 def assign(data: dict, key: str, value: object) -> None:
@@ -100,7 +138,9 @@ def assign(data: dict, key: str, value: object) -> None:
         ("boards", {}, "boards: expected a list"),
         ("iterations.1.rmse_mm", -1, r"iterations\[1\].rmse_mm: expected a finite number >= 0, got -1"),
         ("rmse_after_mm", "small", "rmse_after_mm: expected a finite number >= 0, got 'small'"),
-        ("observability.verdict", "maybe", "observability.verdict: expected 'determined' or 'prior-dominated'"),
+        ("verdict", "maybe", "verdict: expected 'determined', 'prior-dominated', 'inconsistent' or 'not converged'"),
+        ("reasons", "none", "reasons: expected a list"),
+        ("noise_scale", 0, "noise_scale: expected a finite number > 0"),
         ("observability.directions.0.observed", 1, r"observability.directions\[0\].observed: expected true or false"),
         ("rig.baseline_mm", math.nan, "rig.baseline_mm: expected a finite number > 0, got nan"),
         ("provenance.scans.0.path", None, r"provenance.scans\[0\].path: expected text, got null"),
