@@ -172,7 +172,7 @@ class _Solution:
         """Sums by iteration and board, mm²; errors along the scan are no fault of n, and poses take what they can."""
         squared, found = squared_residuals(self.problem, path), self.along_scan.found
         if bool(found.any()):
-            shaken = self.problem.chosen(found)
+            shaken = self.problem.at(found)
             squared[:, found] = squared_residuals(shaken, refitted(shaken, path[:, found]))
         return squared
 
