@@ -18,7 +18,7 @@ from lsvision.stages.calibration.methods import joint
 from lsvision.stages.calibration.model import residuals_in_sigmas, whitened_residuals
 from tests.stages.calibration.boards import RIG, Corners, simulate, thinned
 
-ROUGH, SMOOTH, WAVE = 3, 9, 30  # of the kernel family
+ROUGH, SMOOTH, WAVE = 3, 6, 30  # of the kernel family
 SIDEWAYS, TRAVEL, DEPTH = range(3)
 
 
