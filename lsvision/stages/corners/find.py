@@ -104,8 +104,9 @@ def _triangulated(scan: Scan, left: DetectedCorners, right: DetectedCorners, con
     by_columns = triangulation_jacobian(scan.rig, u_left, u_left - u_right)
     by_left = _point_jacobian(by_columns.sum(-1), pitch * weight)
     by_right = _point_jacobian(-by_columns[..., 1], pitch * (1 - weight))
-    covariance = by_left @ left.covariance @ by_left.mT
-    covariance = covariance + by_right @ right.covariance @ by_right.mT
+    covariance = by_left @ left.covariance @ by_left.mT + by_right @ right.covariance @ by_right.mT
+    mixed = by_left @ left.covariance_with(right) @ by_right.mT
+    covariance = covariance + mixed + mixed.mT
     return _Measured(points, covariance, valid & torch.isfinite(points).all(-1), right.position)
 
 
