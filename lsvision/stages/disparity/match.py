@@ -83,8 +83,10 @@ def measure_block(
     with_gain = relation.exposure is not None or config.matcher == "sgbm"
     match = _measure(gray_left, gray_right, unusable, rig, config, with_gain=with_gain)
     partner = torch.arange(lines.start, lines.stop) + shift
-    alone = ((partner < 0) | (partner >= pair.right.shape[0]))[:, None]
-    return StripMatch(*(values[lines.inner].masked_fill(alone, torch.nan) for values in (match.disparity, match.sigma)))
+    disparity, sigma = (values[lines.inner] for values in (match.disparity, match.sigma))
+    for values in (disparity, sigma):
+        values[(partner < 0) | (partner >= pair.right.shape[0])] = torch.nan
+    return StripMatch(disparity, sigma)
 
 
 def _read_shifted(image: LineImage, lines: HaloRange, shift: int) -> Tensor:
