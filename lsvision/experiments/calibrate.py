@@ -19,6 +19,7 @@ from lsvision.stages.calibration.calibrate import calibrate
 from lsvision.stages.calibration.config import CalibrationConfig
 from lsvision.stages.corners.config import CornersConfig
 from lsvision.stages.corners.find import find_corners
+from lsvision.stages.corners.rows import row_difference
 from lsvision.types import Board, BoardCorners, Calibration, Provenance, Scan
 
 log = logging.getLogger(__name__)
@@ -90,6 +91,14 @@ def find_boards(scans: Sequence[Scan], board: Board, config: CornersConfig) -> l
         for scan in scans:
             found.append(find_corners(scan, board, config))
             bars.advance(bar)
+    for corners in found:
+        difference = row_difference(corners)
+        if difference is not None and difference.is_systematic:
+            log.warning(
+                "%s: the right image shows the corners %+.2f ± %.2f lines later than the left one: the cameras are out "
+                "of step or the rig is not rectified; lines are those of the left camera",
+                corners.scan, difference.lines, difference.sigma,
+            )  # fmt: skip
     return found
 
 

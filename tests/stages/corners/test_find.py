@@ -13,6 +13,7 @@ from lsvision.image.board.refine import DetectedCorners
 from lsvision.simulation import EncoderConfig
 from lsvision.stages.corners.config import CornersConfig
 from lsvision.stages.corners.find import _triangulated, find_corners
+from lsvision.stages.corners.rows import row_difference
 from lsvision.types import DepthView, Scan, StereoPair, TensorImage, Travel
 from tests.stages.other_renderer import tilt_corners, tilt_scans, true_points
 from tests.stages.rendered import BOARD, PITCH, SMALL_RIG, depth_scan, simulation, stereo_scan, true_measurement
@@ -60,6 +61,20 @@ def degraded(image, noise: float, contrast: float, blur: float) -> torch.Tensor:
     grey = cv2.GaussianBlur(grey, (0, 0), blur) if blur else grey
     noisy = 110 + contrast * (torch.from_numpy(grey) - 110) + noise * torch.randn(grey.shape)
     return noisy.round().clamp(0, 255).to(torch.uint8)[..., None]
+
+
+@pytest.mark.parametrize("late", [0, 2])
+def test_cameras_out_of_step_change_no_corner(shared_data: Path, late: int):
+    scan, corners = tilt_scans(shared_data)[0], tilt_corners(shared_data)[0]
+    right = scan.images.right.read(0, scan.lines)
+    shifted = TensorImage(right[(torch.arange(scan.lines) - late).clamp(min=0)])
+    found = find_corners(dataclasses.replace(scan, images=StereoPair(scan.left, shifted)), BOARD)
+    assert found.valid.all()
+    assert (found.points - corners.points).abs().max() < 0.02
+    difference = row_difference(found)
+    assert difference.lines == pytest.approx(late, abs=0.02)
+    assert difference.is_systematic == (late > 0)
+    assert difference.sigma < 0.02
 
 
 def test_one_corner_by_hand():
