@@ -158,7 +158,8 @@ def check(annotation: Any, value: object, key: str, fault: Fault) -> Any:
     # Raised outside of the handler: an error that keeps pydantic's as its context cannot travel between processes.
     with suppress(ValidationError):
         return _adapter(annotation).validate_python(converted)
-    raise fault(key, f"expected {in_words(annotation)}, got {shown(value)}")
+    hint = f"; write [{shown(value)[1:-1]}] for a list of one" if shape.kind is list and isinstance(value, str) else ""
+    raise fault(key, f"expected {in_words(annotation)}, got {shown(value)}{hint}")
 
 
 def build(schema: type[T], data: object, fault: Fault, where: str = "") -> T:

@@ -4,9 +4,6 @@ import logging
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Annotated
-
-from pydantic import BeforeValidator
 
 from lsvision import __version__
 from lsvision.errors import CalibrationError, ConfigError, UnusableCalibrationError
@@ -25,18 +22,11 @@ from lsvision.types import Board, BoardCorners, Calibration, Provenance, Scan
 log = logging.getLogger(__name__)
 
 
-def _as_list(value: object) -> object:
-    return [value] if isinstance(value, str) else value
-
-
 @dataclass(frozen=True, kw_only=True)
 class CalibrateSettings(RunSettings):
-    """Options of the experiment; ``output`` is the file to write, ``calibration.json`` in the run's folder if None.
+    """Options of the experiment; ``output`` is the file to write, ``calibration.json`` in the run's folder if None."""
 
-    ``scans`` may be the path of a single one.
-    """
-
-    scans: Annotated[list[Text], BeforeValidator(_as_list)] = field(default_factory=list)
+    scans: list[Text] = field(default_factory=list)
     board: Board
     corners: CornersConfig
     calibration: CalibrationConfig

@@ -200,6 +200,11 @@ def _engine(config: EngineConfig) -> Engine:
         from lsvision.archive.engines.dask import DaskEngine
     except ModuleNotFoundError as error:
         raise ConfigError(f"engine=dask needs the extra 'cluster': pip install 'lsvision[cluster]' ({error})") from None
-    engine = DaskEngine(config.scheduler, worker_count(config), config.worker_memory_mb)
+    engine = DaskEngine(config.scheduler, worker_count(config), config.worker_memory_mb, config.tls)
     log.info("dashboard: %s", engine.dashboard)
+    if config.scheduler is not None and config.tls is None:
+        log.info(
+            "whoever reaches %s can run programs there: for trusted networks, or set engine.tls_authority",
+            config.scheduler,
+        )
     return engine

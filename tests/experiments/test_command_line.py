@@ -24,7 +24,7 @@ REPROCESS = ("+experiment=reprocess", "calibration=c.json")
     ("overrides", "problem"),
     [
         (["+experiment=corect"], "experiment: there is no 'corect'; choose one of calibrate, "),
-        (["+experiment=calibrate", "scans=DIR"], "error: DIR/scan.yaml: no such file"),
+        (["+experiment=calibrate", "scans=DIR"], "scans: expected a list, got 'DIR'; write [DIR] for a list of one"),
         (["+experiment=calibrate", "scans=[5]"], "scans[0]: expected text, got 5"),
         (["+experiment=calibrate", "scans=5"], "scans: expected a list, got 5"),
         (["+experiment=correct", "scan=a", "calibration=c.json", "export=[obj]"], "export[0]: expected 'tiff', 'ply'"),

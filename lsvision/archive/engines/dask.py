@@ -4,14 +4,17 @@ import logging
 import os
 from concurrent.futures import CancelledError
 from contextlib import suppress
+from dataclasses import asdict
+from pathlib import Path
 from queue import Empty, SimpleQueue
 from types import TracebackType
 
 import dask
 from dask.task_spec import Task as Spec
 from distributed import Client, Future, KilledWorker, LocalCluster, Status
+from distributed.security import Security
 
-from lsvision.archive.engines.protocol import MAX_WORKER_CRASHES, WORKERS_CRASHED, Finished
+from lsvision.archive.engines.protocol import MAX_WORKER_CRASHES, WORKERS_CRASHED, Finished, TlsFiles
 from lsvision.archive.tasks import Outcome, Task, run_in_worker
 from lsvision.errors import ConfigError, LsvisionError
 
@@ -42,18 +45,20 @@ class DaskEngine:
         scheduler: address as ``tcp://host:8786``.
         workers: of a local cluster.
         worker_memory_mb: of a local cluster; a worker that takes far more is restarted.
+        tls: certificates, where only those who have one may take part.
 
     Raises:
-        ConfigError: nothing answers at the address.
+        ConfigError: nothing answers at the address, or a certificate cannot be read.
     """
 
-    def __init__(self, scheduler: str | None, workers: int, worker_memory_mb: int) -> None:
+    def __init__(self, scheduler: str | None, workers: int, worker_memory_mb: int, tls: TlsFiles | None = None) -> None:
         self._finished: SimpleQueue[Future] = SimpleQueue()
         self._tasks: dict[Future, Task] = {}
         self._settings = dask.config.set(_SETTINGS)
         for name in _LOGGERS:
             logging.getLogger(name).setLevel(logging.CRITICAL)
         self._cluster, self._workers = None, workers
+        security = None if tls is None else _security(tls)
         if scheduler is None:
             self._cluster = LocalCluster(
                 n_workers=workers,
@@ -63,9 +68,11 @@ class DaskEngine:
                 host="127.0.0.1",
                 dashboard_address="127.0.0.1:0",
                 silence_logs=50,
+                security=security,
+                protocol=None if tls is None else "tls://",
             )
         try:
-            self._client = Client(scheduler or self._cluster, set_as_default=False, timeout="10s")
+            self._client = Client(scheduler or self._cluster, security=security, set_as_default=False, timeout="10s")
         except (OSError, TimeoutError, ValueError) as error:
             raise ConfigError(f"engine.scheduler: nothing answers at {scheduler}") from error
 
@@ -136,6 +143,23 @@ class DaskEngine:
         except (CancelledError, OSError) as error:
             raise _lost() from error
         return self._tasks.pop(future), result
+
+
+def _security(tls: TlsFiles) -> Security:
+    """Certificates as Dask takes them.
+
+    Raises:
+        ConfigError: a file cannot be read; names it.
+    """
+    files = asdict(tls)
+    for name, file in files.items():
+        try:
+            Path(file).read_bytes()
+        except OSError as error:
+            raise ConfigError(f"engine.tls_{name}: {file}: {error.strerror}") from error
+    sides = {f"tls_{side}_{kind}": files[name] for side in ("client", "scheduler", "worker")
+             for kind, name in (("cert", "certificate"), ("key", "key"))}  # fmt: skip
+    return Security(tls_ca_file=tls.authority, require_encryption=True, **sides)
 
 
 async def _replace_lost(cluster: LocalCluster) -> None:

@@ -19,18 +19,45 @@ Finished = tuple[Task, Outcome]
 
 
 @dataclass(frozen=True)
+class TlsFiles:
+    """Certificate of the authority that all sides trust, and certificate and key of this side, as PEM files."""
+
+    authority: str
+    certificate: str
+    key: str
+
+
+@dataclass(frozen=True)
 class EngineConfig(Checked):
     """Where strips are computed.
 
     ``workers`` is as many as cores and memory allow where it is None. ``worker_memory_mb`` bounds what one takes:
     strips are sized by it. ``scheduler`` is the address of a Dask scheduler; a local cluster is started where it is
-    None.
+    None. ``tls_authority``, ``tls_certificate`` and ``tls_key``, PEM files, encrypt what passes between this process,
+    scheduler and workers of Dask, and keep everybody out who has no certificate of the authority; all three or none.
     """
 
     kind: Literal["local", "dask"] = "local"
     workers: PositiveInt | None = None
     worker_memory_mb: PositiveInt = 2048
     scheduler: Text | None = None
+    tls_authority: Text | None = None
+    tls_certificate: Text | None = None
+    tls_key: Text | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        files = {name: getattr(self, name) for name in ("tls_authority", "tls_certificate", "tls_key")}
+        missing = [name for name, file in files.items() if file is None]
+        if 0 < len(missing) < len(files):
+            raise self.fault(missing[0], "missing; certificates are three files")
+
+    @property
+    def tls(self) -> TlsFiles | None:
+        """The certificates, where they are given."""
+        if self.tls_authority is None or self.tls_certificate is None or self.tls_key is None:
+            return None
+        return TlsFiles(self.tls_authority, self.tls_certificate, self.tls_key)
 
 
 class Engine(Protocol):

@@ -2,6 +2,7 @@
 
 import itertools
 import math
+import struct
 import zlib
 from pathlib import Path
 from typing import Any
@@ -42,7 +43,8 @@ def check_chunks(path: Path, array: Any, axis: int, lines: tuple[int, int]) -> N
     for place in itertools.product(*counts):
         file = path / array.metadata.encode_chunk_key(place)
         if file.is_file() and not _fits(file, compressor, expected):
-            raise FileFormatError(path, f"chunk {file.relative_to(path)} holds more than its {expected} bytes")
+            problem = f"chunk {file.relative_to(path)} holds more than its {expected} bytes, or is damaged"
+            raise FileFormatError(path, problem)
 
 
 def _compressor(path: Path, array: Any) -> str | None:
@@ -67,8 +69,15 @@ def _fits(file: Path, compressor: str, expected: int) -> bool:
     if compressor == "Zstd":
         declared = _zstd_bytes(head)
         return _zstd_fits(file, expected) if declared is None else declared <= expected
-    place = slice(4, 8) if compressor == "Blosc" else slice(0, 4)
-    return int.from_bytes(head[place], "little") <= expected
+    if compressor == "Blosc":
+        return _blosc_fits(head, file.stat().st_size, expected)
+    return int.from_bytes(head[:4], "little") <= expected
+
+
+def _blosc_fits(head: bytes, stored: int, expected: int) -> bool:
+    """Whether a Blosc header's sizes are possible: its decoder believes them, and reads beyond the end of the file."""
+    content, block, compressed = struct.unpack("<III", head[4:16].ljust(12, b"\0"))
+    return len(head) >= 16 and content <= expected and block <= max(content, 1) and 16 <= compressed <= stored
 
 
 def _zstd_bytes(head: bytes) -> int | None:

@@ -76,8 +76,8 @@ def _check_level(product: Product, key: str, array: Any, shape: tuple[int, int])
         raise FileFormatError(product.path, f"{missing} of {array.nchunks} chunks are missing", key)
     step = array.chunks[-2]
     for row in range(0, shape[0], step):
-        check_chunks(product.path / key, array, array.ndim - 2, (row, min(row + step, shape[0])))
         try:
+            check_chunks(product.path / key, array, array.ndim - 2, (row, min(row + step, shape[0])))
             array[..., row : row + step, :]
         except Exception as error:  # on damaged data each codec raises a type of its own
             rows = f"rows {row}-{min(row + step, shape[0]) - 1}"

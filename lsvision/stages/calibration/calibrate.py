@@ -14,6 +14,7 @@ from lsvision.estimation import Info, Posterior
 from lsvision.geometry import sharp_depth_mm
 from lsvision.stages.calibration.config import CalibrationConfig
 from lsvision.stages.calibration.correlated import ErrorsAlongScan
+from lsvision.stages.calibration.exchanged import images_exchanged
 from lsvision.stages.calibration.measurements import BoardMeasurements, SoundProblem
 from lsvision.stages.calibration.model import refitted, rotations, squared_residuals, translations
 from lsvision.stages.calibration.noise import board_chi_square
@@ -84,13 +85,16 @@ def calibrate(boards: Sequence[BoardCorners], rig: Rig, config: CalibrationConfi
     known = Known(batch.covariance, config.prior_sigma, scale, depth_mm)
     observability = observe(solution.weighed, solution.posterior.mean, known)
     iterations, converged = _iterations(batch), bool(batch.converged)
-    contradictions = rmse_grew(iterations[0].rmse_mm, iterations[-1].rmse_mm)
+    before_mm, after_mm = iterations[0].rmse_mm, iterations[-1].rmse_mm
+    contradictions = rmse_grew(before_mm, after_mm)
+    if scale > 1 or bool((batch.along_scan_rms_mm > 0).any()):  # where the residuals are no noise as stated
+        contradictions = images_exchanged(boards, rig, config, after_mm) or contradictions
     judged = judge(not_settled(converged, int(batch.iterations)), contradictions, observability)
     return Calibration(
         method=config.method,
         motion=Motion(batch.n, batch.covariance),
-        rmse_before_mm=iterations[0].rmse_mm,
-        rmse_after_mm=iterations[-1].rmse_mm,
+        rmse_before_mm=before_mm,
+        rmse_after_mm=after_mm,
         iterations=iterations,
         boards=_board_fits(boards, batch, board_chi_square(solution.problem, solution.posterior.mean)),
         observability=observability,

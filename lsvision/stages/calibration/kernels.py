@@ -1,7 +1,7 @@
 """The kernels among which the errors along a scan are looked for, on knots spread over the boards' travel.
 
 Lengths are in units of the largest travel that a board of the problem takes, so that one table serves all problems.
-Errors that are longer than three of them are a motion n to every observer, and belong to it.
+Errors that are longer than four of them are a motion n to every observer, and belong to it.
 """
 
 import math
@@ -17,8 +17,8 @@ from lsvision.estimation.gaussian_process import covariance_root, exponential, m
 KNOTS = 32
 INTERVALS = KNOTS - 3  # over the travel; interpolation takes one more knot at each end
 
-_LENGTHS = tuple(2.0**k for k in range(-4, 0))  # of broad-band errors: rough (exponential) and smooth (Matérn)
-_WAVELENGTHS = tuple(3.0 * 2.0 ** (-k / 8.5) for k in range(31))  # 3 .. 1/4
+_LENGTHS = tuple(2.0**k for k in range(-4, 1))  # of broad-band errors: rough (exponential) and smooth (Matérn)
+_WAVELENGTHS = tuple(4.0 * 2.0 ** (-k / 8.5) for k in range(35))  # 4 .. 1/4
 _COHERENCE = (1.5, 8.0)  # of waves: how far one keeps its phase
 _WAVE_RANK = 16  # of a wave's covariance, the rest of which is rounding
 # Amplitudes, in units of the residuals' rms: prior log-uniform between them.

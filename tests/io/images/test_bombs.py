@@ -56,6 +56,18 @@ def test_a_chunk_that_holds_more_than_its_size(tmp_path, codec, content):
         image.read(10, 30)
 
 
+@pytest.mark.parametrize("place", [4, 8, 12])
+def test_a_blosc_chunk_whose_header_leads_beyond_it(tmp_path, place):
+    """Its decoder would read there, and end the process."""
+    path = zarr_image(tmp_path / "a.zarr", compressors=[BloscCodec(cname="lz4")])
+    chunk = path / "c" / "1" / "0" / "0"
+    content = bytearray(chunk.read_bytes())
+    content[place : place + 4] = struct.pack("<I", 0x70212123)
+    chunk.write_bytes(content)
+    with pytest.raises(FileFormatError, match=r"chunk c/1/0/0 holds more than its 960 bytes, or is damaged"):
+        open_line_image(path).read(10, 30)
+
+
 @pytest.mark.parametrize("compressor", [numcodecs.LZ4(), numcodecs.Zlib(), numcodecs.Zstd(), None])
 def test_arrays_of_format_2(tmp_path, compressor):
     path = zarr_image(tmp_path / "a.zarr", zarr_format=2, compressors=compressor)

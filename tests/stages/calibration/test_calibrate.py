@@ -137,7 +137,7 @@ def test_errors_of_one_board_are_as_large_as_stated_over_all_that_the_prior_allo
     options = {"process_sigma": 0.0} if method == "sequential" else {}
     found = batch_of(corners, CalibrationConfig(method=method, prior_sigma=prior_sigma, **options))
     settled = found.converged
-    assert settled.double().mean() > 0.9
+    assert settled.double().mean() > 0.85
     normalised = nees((found.n - corners.n)[settled], torch.linalg.cholesky(found.covariance[settled]))
     assert 2.5 < normalised.mean() < 3.6
     assert found.n.isfinite().all()

@@ -18,7 +18,7 @@ from lsvision.stages.calibration.methods import joint
 from lsvision.stages.calibration.model import residuals_in_sigmas, whitened_residuals
 from tests.stages.calibration.boards import RIG, Corners, simulate, thinned
 
-ROUGH, SMOOTH, WAVE = 3, 6, 30  # of the kernel family
+ROUGH, SMOOTH, WAVE = 3, 7, 30  # of the kernel family
 SIDEWAYS, TRAVEL, DEPTH = range(3)
 
 
@@ -231,3 +231,20 @@ def test_what_was_allowed_for_is_said():
     assert error.in_words.startswith("errors along the scan: 0.0")
     assert " mm rms sideways, about 1" in error.in_words
     assert calibrate(simulate().boards(), RIG, CalibrationConfig()).errors_along_scan == ()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("rms_mm", "wavelength_mm", "components"),
+    [
+        (0.03, 61.0, (SIDEWAYS, DEPTH)),
+        (0.03, 233.0, (SIDEWAYS, DEPTH)),
+        (0.03, 480.0, (SIDEWAYS, DEPTH)),
+        (0.1 / math.sqrt(2), 400.0, (TRAVEL,)),
+    ],
+)
+def test_normalised_errors_of_many_shaken_sets_keep_near_their_band(rms_mm, wavelength_mm, components):
+    """Nor far below it: that would be sigmas much wider than need be."""
+    torch.manual_seed(9)
+    corners = shaken(simulate(batch=(40,)), rms_mm, wavelength_mm, components)
+    assert 1.2 < errors(corners, solved(corners)).mean() < 3.6
