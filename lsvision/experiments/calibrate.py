@@ -90,6 +90,7 @@ def _summary(calibration: Calibration) -> dict:
         "boards": len(calibration.boards),
         "verdict": calibration.verdict,
         "reasons": list(calibration.reasons),
+        "notes": list(calibration.notes),
         "noise_scale": calibration.noise_scale,
         "n": calibration.motion.n.tolist(),
         "sigma": calibration.motion.sigma.tolist(),

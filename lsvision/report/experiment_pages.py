@@ -92,7 +92,7 @@ def _motion_headlines(calibration: Calibration) -> list[Headline]:
 def _explained(calibration: Calibration) -> list[str]:
     """The reasons for the verdict, and the advice where it is not one of them."""
     advice = calibration.observability.advice
-    return [*calibration.reasons, *([] if advice in calibration.reasons else [advice])]
+    return [*calibration.reasons, *calibration.notes, *([] if advice in calibration.reasons else [advice])]
 
 
 def product_report(

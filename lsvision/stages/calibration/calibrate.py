@@ -10,13 +10,19 @@ from torch import Tensor
 
 from lsvision.errors import CalibrationError, ConfigError
 from lsvision.estimation import Info, Posterior
+from lsvision.stages.calibration.board_scale import explained_by_size, with_unknown_size
 from lsvision.stages.calibration.config import CalibrationConfig
+from lsvision.stages.calibration.findings import find_flaws
+from lsvision.stages.calibration.hypotheses import Known
 from lsvision.stages.calibration.measurements import BoardMeasurements, SoundProblem
 from lsvision.stages.calibration.methods import estimate
+from lsvision.stages.calibration.misplaced import column_rows, largest_residuals
 from lsvision.stages.calibration.model import rotations, squared_residuals, translations
 from lsvision.stages.calibration.noise import board_chi_square, noise_scale
 from lsvision.stages.calibration.observability import observe
+from lsvision.stages.calibration.outliers import outlying
 from lsvision.stages.calibration.problem import BoardProblem, MountingPitch
+from lsvision.stages.calibration.scatter import scatter, widened
 from lsvision.stages.calibration.verdict import judge, not_settled, rmse_grew
 from lsvision.types import BoardCorners, BoardFit, Calibration, Iteration, Motion, Pose, Rig
 
@@ -73,7 +79,9 @@ def calibrate(boards: Sequence[BoardCorners], rig: Rig, config: CalibrationConfi
         )
     observability = observe(solution.problem, solution.posterior.mean, config.prior_sigma, scale)
     iterations, converged = _iterations(batch), bool(batch.converged)
-    contradictions = rmse_grew(iterations[0].rmse_mm, iterations[-1].rmse_mm)
+    known = Known(config.prior_sigma, config.board_scale_sigma)
+    findings = find_flaws(boards, solution.problem, solution.start, solution.outlying, known)
+    contradictions = [*findings.contradictions, *rmse_grew(iterations[0].rmse_mm, iterations[-1].rmse_mm)]
     judged = judge(not_settled(converged, int(batch.iterations)), contradictions, observability)
     return Calibration(
         method=config.method,
@@ -81,11 +89,12 @@ def calibrate(boards: Sequence[BoardCorners], rig: Rig, config: CalibrationConfi
         rmse_before_mm=iterations[0].rmse_mm,
         rmse_after_mm=iterations[-1].rmse_mm,
         iterations=iterations,
-        boards=_board_fits(boards, batch, board_chi_square(solution.problem, solution.posterior)),
+        boards=_board_fits(boards, batch, solution),
         observability=observability,
         rig=rig,
         verdict=judged.verdict,
         reasons=judged.reasons,
+        notes=findings.notes,
         converged=converged,
         noise_scale=scale,
     )
@@ -115,11 +124,18 @@ def calibrate_batch(
 
 @dataclass(frozen=True)
 class _Solution:
-    """Problems of a batch with their posteriors; these have the noise scaled, the problems as it was given."""
+    """Problems of a batch, without outlying corners, and their posteriors.
+
+    The posteriors have the noise scaled, the problems as it was given.
+    """
 
     problem: BoardProblem
+    start: Float[Tensor, "*batch state"]
+    outlying: Bool[Tensor, "*batch boards corners"]
     posterior: Posterior
     noise_scale: Float[Tensor, "*batch"]
+    scatter: Float[Tensor, "*batch"]
+    prior_sigma: float
 
     def summary(self) -> BatchCalibration:
         """The solution as motion and poses of the boards, and its path."""
@@ -130,9 +146,12 @@ class _Solution:
         squared, corners = squared_residuals(problem, path), problem.valid.sum(-1)
         board_rmse = (squared / corners).sqrt()
         motion_factor = torch.where(singular[..., None, None], torch.nan, posterior.factor[..., -3:, :])
+        covariance = motion_factor @ motion_factor.mT
+        if bool((self.scatter > 1).any()):
+            covariance = widened(covariance, self.scatter, self.prior_sigma)
         return BatchCalibration(
             n=state[..., -3:],
-            covariance=motion_factor @ motion_factor.mT,
+            covariance=covariance,
             rotation=rotations(problem, state),
             translation_mm=translations(problem, state),
             rmse_path_mm=(squared.sum(-1) / corners.sum(-1)).sqrt(),
@@ -147,19 +166,26 @@ class _Solution:
 
 
 def _solve(measured: BoardMeasurements, config: CalibrationConfig) -> _Solution:
-    """The problems estimated, once more where their residuals ask for a larger noise."""
+    """The problems estimated without outlying corners, once more where their residuals ask for a larger noise."""
     config = config.resolved()
     _check(config, measured.points.shape[-3])
     posed = SoundProblem.of(measured, _mounting_pitch(config))
+    off = outlying(posed.problem)
+    if bool(off.any()):
+        posed = SoundProblem.of(replace(measured, valid=measured.valid & ~off), _mounting_pitch(config))
     problem, start = posed.problem, posed.start
     posterior = estimate(problem, start, config)
-    drifting = config.method == "sequential" and bool(config.process_sigma)  # residuals of one n are then no noise
-    scale = torch.ones_like(start[..., 0]) if drifting else noise_scale(problem, posterior)
-    if bool((scale > 1).any()):
-        noisier = replace(problem, noise_chol=problem.noise_chol * scale.sqrt()[..., None, None, None, None])
-        posterior = _merge(scale > 1, estimate(noisier, start, config), posterior)
+    scale = apart = torch.ones_like(start[..., 0])
+    if config.method != "sequential" or not config.process_sigma:  # residuals of an n that drifts are no noise
+        by_size = explained_by_size(problem, posterior, config.board_scale_sigma)
+        scale = noise_scale(problem, posterior, by_size)
+        if bool((scale > 1).any()):
+            noisier = replace(problem, noise_chol=problem.noise_chol * scale.sqrt()[..., None, None, None, None])
+            posterior = _merge(scale > 1, estimate(noisier, start, config), posterior)
+        apart = scatter(problem, posterior, scale, by_size, config.prior_sigma)
+        posterior = with_unknown_size(problem, posterior, scale, config.board_scale_sigma)
     info = torch.where(posed.sound, posterior.info, int(Info.SINGULAR))
-    return _Solution(problem, replace(posterior, info=info), scale)
+    return _Solution(problem, start, off, replace(posterior, info=info), scale, apart, config.prior_sigma)
 
 
 def _check(config: CalibrationConfig, boards: int) -> None:
@@ -200,15 +226,20 @@ def _iterations(batch: BatchCalibration) -> tuple[Iteration, ...]:
     )
 
 
-def _board_fits(boards: Sequence[BoardCorners], batch: BatchCalibration, chi_square: Tensor) -> tuple[BoardFit, ...]:
+def _board_fits(boards: Sequence[BoardCorners], batch: BatchCalibration, solution: _Solution) -> tuple[BoardFit, ...]:
+    problem = solution.problem
+    chi_square = board_chi_square(problem, solution.posterior)
+    largest = largest_residuals(problem, solution.posterior.mean)
     return tuple(
         BoardFit(
             scan=board.scan,
-            corners=int(board.valid.sum()),
+            corners=int(problem.valid[i].sum()),
             pose=Pose(batch.rotation[i], batch.translation_mm[i]),
             rmse_before_mm=float(batch.board_rmse_before_mm[i]),
             rmse_after_mm=float(batch.board_rmse_after_mm[i]),
             reduced_chi_square=float(chi_square[i]),
+            outliers=column_rows(board.board_points, solution.outlying[i, : len(board.valid)]),
+            largest_residual=largest[i],
         )
         for i, board in enumerate(boards)
     )

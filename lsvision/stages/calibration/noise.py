@@ -18,9 +18,15 @@ from lsvision.stages.calibration.problem import BoardProblem
 _NOISE_TEST_LEVEL = 1e-3
 
 
-def noise_scale(problem: BoardProblem, posterior: Posterior) -> Float[Tensor, "*batch"]:
-    """Reduced chi-square of the residuals where they are larger than chance allows, else 1."""
-    squared = _squared_residuals(problem, posterior).sum(-1)
+def noise_scale(
+    problem: BoardProblem, posterior: Posterior, explained: Float[Tensor, "*batch"]
+) -> Float[Tensor, "*batch"]:
+    """Reduced chi-square of the residuals where they are larger than chance allows, else 1.
+
+    Args:
+        explained: part of the squared residuals that is known not to be noise, in sigmas.
+    """
+    squared = (squared_residuals_by_board(problem, posterior).sum(-1) - explained).clamp(min=0)
     freedom = 3.0 * problem.valid.sum((-2, -1)) - posterior.mean.shape[-1]
     unlikely = torch.special.gammaincc(freedom / 2, squared / 2) < _NOISE_TEST_LEVEL
     return torch.where(unlikely, squared / freedom, 1.0)
@@ -32,11 +38,11 @@ def board_chi_square(problem: BoardProblem, posterior: Posterior) -> Float[Tenso
     The unknowns are shared out: the six of its own pose to each board, an equal part of n to all.
     """
     freedom = 3.0 * problem.valid.sum(-1) - 6.0 - 3.0 / problem.boards
-    return _squared_residuals(problem, posterior) / freedom
+    return squared_residuals_by_board(problem, posterior) / freedom
 
 
-def _squared_residuals(problem: BoardProblem, posterior: Posterior) -> Tensor:
-    """Sums over the corners of each board, ``(*batch, boards)``."""
+def squared_residuals_by_board(problem: BoardProblem, posterior: Posterior) -> Float[Tensor, "*batch boards"]:
+    """Squared residuals in sigmas of the given covariance, summed over the corners of each board."""
     corners_alone = problem if problem.pitch is None else replace(problem, pitch=None)
     rows = linearise(corners_alone, posterior.mean, posterior.factor).matrix[..., -1]
     return rows.unflatten(-1, (problem.boards, -1)).square().sum(-1)
