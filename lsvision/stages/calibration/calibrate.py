@@ -18,7 +18,7 @@ from lsvision.stages.calibration.measurements import BoardMeasurements, SoundPro
 from lsvision.stages.calibration.methods import estimate
 from lsvision.stages.calibration.misplaced import column_rows, largest_residuals
 from lsvision.stages.calibration.model import rotations, squared_residuals, translations
-from lsvision.stages.calibration.noise import board_chi_square, noise_scale
+from lsvision.stages.calibration.noise import board_chi_square, noise_scale, squared_residuals_of_boards
 from lsvision.stages.calibration.observability import observe
 from lsvision.stages.calibration.outliers import outlying
 from lsvision.stages.calibration.problem import BoardProblem, MountingPitch
@@ -178,11 +178,13 @@ def _solve(measured: BoardMeasurements, config: CalibrationConfig) -> _Solution:
     scale = apart = torch.ones_like(start[..., 0])
     if config.method != "sequential" or not config.process_sigma:  # residuals of an n that drifts are no noise
         by_size = explained_by_size(problem, posterior, config.board_scale_sigma)
-        scale = noise_scale(problem, posterior, by_size)
+        squared = squared_residuals_of_boards(problem, posterior)
+        scale = noise_scale(problem, squared, by_size)
         if bool((scale > 1).any()):
             noisier = replace(problem, noise_chol=problem.noise_chol * scale.sqrt()[..., None, None, None, None])
             posterior = _merge(scale > 1, estimate(noisier, start, config), posterior)
-        apart = scatter(problem, posterior, scale, by_size, config.prior_sigma)
+            squared = squared_residuals_of_boards(problem, posterior)
+        apart = scatter(problem, squared, posterior, scale, by_size, config.prior_sigma)
         posterior = with_unknown_size(problem, posterior, scale, config.board_scale_sigma)
     info = torch.where(posed.sound, posterior.info, int(Info.SINGULAR))
     return _Solution(problem, start, off, replace(posterior, info=info), scale, apart, config.prior_sigma)

@@ -19,17 +19,18 @@ _NOISE_TEST_LEVEL = 1e-3
 
 
 def noise_scale(
-    problem: BoardProblem, posterior: Posterior, explained: Float[Tensor, "*batch"]
+    problem: BoardProblem, squared: Float[Tensor, "*batch boards"], explained: Float[Tensor, "*batch"]
 ) -> Float[Tensor, "*batch"]:
     """Reduced chi-square of the residuals where they are larger than chance allows, else 1.
 
     Args:
+        squared: residuals of each board, see ``squared_residuals_of_boards``.
         explained: part of the squared residuals that is known not to be noise, in sigmas.
     """
-    squared = (squared_residuals_by_board(problem, posterior).sum(-1) - explained).clamp(min=0)
-    freedom = 3.0 * problem.valid.sum((-2, -1)) - posterior.mean.shape[-1]
-    unlikely = torch.special.gammaincc(freedom / 2, squared / 2) < _NOISE_TEST_LEVEL
-    return torch.where(unlikely, squared / freedom, 1.0)
+    total = (squared.sum(-1) - explained).clamp(min=0)
+    freedom = 3.0 * problem.valid.sum((-2, -1)) - (6 * problem.boards + 3)
+    unlikely = torch.special.gammaincc(freedom / 2, total / 2) < _NOISE_TEST_LEVEL
+    return torch.where(unlikely, total / freedom, 1.0)
 
 
 def board_chi_square(problem: BoardProblem, posterior: Posterior) -> Float[Tensor, "*batch boards"]:
@@ -38,10 +39,10 @@ def board_chi_square(problem: BoardProblem, posterior: Posterior) -> Float[Tenso
     The unknowns are shared out: the six of its own pose to each board, an equal part of n to all.
     """
     freedom = 3.0 * problem.valid.sum(-1) - 6.0 - 3.0 / problem.boards
-    return squared_residuals_by_board(problem, posterior) / freedom
+    return squared_residuals_of_boards(problem, posterior) / freedom
 
 
-def squared_residuals_by_board(problem: BoardProblem, posterior: Posterior) -> Float[Tensor, "*batch boards"]:
+def squared_residuals_of_boards(problem: BoardProblem, posterior: Posterior) -> Float[Tensor, "*batch boards"]:
     """Squared residuals in sigmas of the given covariance, summed over the corners of each board."""
     corners_alone = problem if problem.pitch is None else replace(problem, pitch=None)
     rows = linearise(corners_alone, posterior.mean, posterior.factor).matrix[..., -1]
