@@ -28,6 +28,17 @@ class FileFormatError(LsvisionError):
         return type(self), (self.path, self.problem, self.key)
 
 
+class ScanChangedError(LsvisionError):
+    """A scan whose files are not those any more that a run planned to read."""
+
+    def __init__(self, path: Path | str) -> None:
+        super().__init__(f"{path}: changed while it was being read; the next run starts it afresh")
+        self.path = Path(path)
+
+    def __reduce__(self) -> tuple[type, tuple[Path]]:
+        return type(self), (self.path,)
+
+
 class WriteError(LsvisionError):
     """A file that cannot be written, as on a full disk; the message names it."""
 

@@ -284,6 +284,24 @@ class BoardFit:
 
 
 @dataclass(frozen=True)
+class ErrorAlongScan:
+    """An error that all corners of a line share, as of vibration or of the encoder, in one component of their points.
+
+    ``length_mm`` is that of a wave along the travel whose correlation falls as fast.
+    """
+
+    component: Literal["x", "travel", "z"]
+    rms_mm: Positive
+    length_mm: Positive
+
+    @property
+    def in_words(self) -> str:
+        """What it is, for a reader."""
+        where = {"x": "sideways", "travel": "in the travel", "z": "in depth"}[self.component]
+        return f"errors along the scan: {self.rms_mm:.2g} mm rms {where}, about {self.length_mm:.2g} mm long"
+
+
+@dataclass(frozen=True)
 class ObservedDirection:
     """A direction of n and how much the data narrowed the prior along it."""
 
@@ -324,7 +342,7 @@ class Calibration:
     n to the prior; else ``determined``. ``reasons`` are the sentences that say why it is not ``determined``,
     ``notes`` what else was noticed and allowed for.
     ``noise_scale`` is how many times larger than the corners' given covariance their residuals are, 1 where they are as
-    expected; the covariance of n allows for it.
+    expected; the covariance of n allows for it, and for the ``errors_along_scan`` that the residuals show.
     """
 
     method: CalibrationMethod
@@ -340,6 +358,7 @@ class Calibration:
     notes: tuple[str, ...] = ()
     converged: bool = True
     noise_scale: float = 1.0
+    errors_along_scan: tuple[ErrorAlongScan, ...] = ()
     provenance: Provenance = field(default_factory=lambda: Provenance("", ""))
 
     @property
@@ -390,7 +409,8 @@ class ProductStrip:
         color: in the scan's dtype.
         height: float32, mm towards the cameras from the middle of the plane of zero disparity, NaN where not measured.
         valid: where the height was measured.
-        source: float32 (line, column) of the scan that the colour came from, NaN where no line saw the cell.
+        source: (line, column) of the scan that the colour came from, NaN where no line saw the cell; float32, for long
+            scans float64.
         sigma: float32, mm, standard deviations of (q_x, q_y, q_z), where they were asked for.
     """
 

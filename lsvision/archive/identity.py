@@ -2,11 +2,12 @@
 
 import hashlib
 import json
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from lsvision.errors import FileFormatError
+from lsvision.errors import FileFormatError, ScanChangedError
 from lsvision.io import scan_files
 from lsvision.stages.correction.config import CorrectionConfig
 from lsvision.stages.disparity.config import DisparityConfig
@@ -14,11 +15,22 @@ from lsvision.stages.disparity.config import DisparityConfig
 
 @dataclass(frozen=True)
 class ScanFiles:
-    """A scan on disk as every worker opens it; ``stamp`` changes with its files."""
+    """A scan on disk as every worker opens it; ``stamp`` changes with its files, ``lines`` is its length."""
 
     path: str
     stamp: str
+    lines: int
     repair_encoder: bool
+
+    def check_unchanged(self) -> None:
+        """Check that the files are those that were planned.
+
+        Raises:
+            ScanChangedError: they are not.
+            FileFormatError: ``scan.yaml`` cannot be read any more.
+        """
+        if stamp_of(Path(self.path)) != self.stamp:
+            raise ScanChangedError(self.path)
 
 
 def key_of(*values: Any) -> str:
@@ -27,16 +39,23 @@ def key_of(*values: Any) -> str:
 
 
 def stamp_of(folder: Path) -> str:
-    """Hash of path, size and time of change of every file of a scan: equal as long as the files are untouched.
+    """Hash of the list of a scan's files with the size, time of change and inode of each.
+
+    Equal as long as the files are untouched: one that takes the place of another has another inode, though it may have
+    been given the other's size and time.
 
     Raises:
         FileFormatError: ``scan.yaml`` cannot be read.
     """
+    stamps = []
     try:
-        files = [(str(file), file.stat()) for file in scan_files(folder) if file.exists()]
+        for file in scan_files(folder):
+            with suppress(FileNotFoundError):
+                state = file.stat()
+                stamps.append((str(file), state.st_size, state.st_mtime_ns, state.st_ino))
     except OSError as error:
         raise FileFormatError(folder, f"cannot be read: {error.strerror}") from error
-    return key_of([(path, state.st_size, state.st_mtime_ns) for path, state in files])
+    return key_of(stamps)
 
 
 def depth_key(input_sha256: str, config: DisparityConfig, with_sigma: bool, version: str) -> str:

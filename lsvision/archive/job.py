@@ -2,7 +2,7 @@
 
 import shutil
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -83,11 +83,15 @@ class ScanJob:
         """Tasks of the first step whose result is missing, to be run in any order and at once; none when all are there.
 
         Raises:
+            ScanChangedError: the scan is not the one that was planned any more.
             FileFormatError: the scan cannot be read any more, or its product would replace that of another scan.
             NothingMeasuredError: less of the product was measured than ``min_measured_share``.
             WriteError: the disk is full.
         """
-        return self._hashing() or self._matching() or self._correcting() or self._finishing()
+        tasks = self._hashing() or self._matching() or self._correcting() or self._finishing()
+        if tasks:
+            self.planned.files.check_unchanged()
+        return tasks
 
     def record(self, task: Task, outcome: Outcome) -> None:
         """Record what came of a task."""
@@ -168,7 +172,7 @@ class ScanJob:
         n, covariance = tuple(motion.n.tolist()), tuple(map(tuple, motion.covariance.tolist()))
         store = str(self._depth_store) if self._depth_store else None
         source = CorrectionInput(
-            planned.files, store, self._place.processing.disparity, n, covariance, planned.correction
+            planned.files, store, self._place.processing.disparity, n, covariance, planned.correction, planned.grid
         )
         work = [CorrectStrip(source, number, self._product) for number in range(planned.product_strips)]
         return self._missing("product", self._strips_key, work)
@@ -216,19 +220,21 @@ class ScanJob:
     def _work(self) -> Path:
         return self._place.work / key_of(self.planned.key)[:16]
 
-    # What depends on the scan's hash is asked for only when that is known.
+    # What depends on the scan's hash is asked for only when that is known. The size of what is stored is part of its
+    # key: a plan made while the scan changed must not leave stores that do not fit the next.
 
     @cached_property
     def _depth_key(self) -> str:
-        processing = self._place.processing
-        return depth_key(self._row.input_sha256, processing.disparity, processing.with_sigma, __version__)
+        processing, planned = self._place.processing, self.planned
+        key = depth_key(self._row.input_sha256, processing.disparity, processing.with_sigma, __version__)
+        return key_of(key, planned.lines, planned.width)
 
     @cached_property
     def _strips_key(self) -> str:
         processing = self._place.processing
         sha256, correction = self.planned.calibration.sha256, processing.correction
         key = product_key(self._depth_key, sha256, correction, processing.repair_encoder)
-        return key_of(key, self.planned.correction.strip_rows)
+        return key_of(key, self.planned.correction.strip_rows, asdict(self.planned.grid))
 
     @property
     def _depth_store(self) -> Path | None:

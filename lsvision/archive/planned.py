@@ -3,13 +3,16 @@
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 
+import psutil
+
 from lsvision.archive.identity import ScanFiles, key_of, options_without_strips, stamp_of
 from lsvision.archive.sources.calibrations import DatedCalibration, calibration_for
 from lsvision.archive.sources.catalogue import Found
 from lsvision.errors import FileFormatError
+from lsvision.geometry import ProductFrame
 from lsvision.io import read_scan
 from lsvision.stages.correction.config import CorrectionConfig
-from lsvision.stages.correction.grid import plan_product
+from lsvision.stages.correction.grid import most_lines, plan_product, source_dtype
 from lsvision.stages.disparity.config import DisparityConfig
 from lsvision.stages.disparity.match import disparity_range
 from lsvision.types import ProductGrid, Scan, StereoPair
@@ -24,7 +27,7 @@ _MIN_ROWS = 32
 
 @dataclass(frozen=True)
 class Processing:
-    """What is done to every scan, and the memory that a worker may take for it; None where it is not bounded."""
+    """What is done to every scan, and the memory that a worker may take for it; None for all that the machine has."""
 
     disparity: DisparityConfig
     correction: CorrectionConfig
@@ -79,33 +82,35 @@ def plan_scan(found: Found, calibrations: Sequence[DatedCalibration], processing
     scan = read_scan(found.path, repair_encoder=processing.repair_encoder)
     stamp = stamp_of(found.path)  # of files that are known to be images: a folder of any other kind may have no end
     calibration = calibration_for(scan, calibrations)
-    grid = plan_product(scan, calibration.calibration.motion, processing.correction)
+    motion = calibration.calibration.motion
+    grid, frame = plan_product(scan, motion, processing.correction), ProductFrame(scan.rig, scan.travel, motion.n)
     return PlannedScan(
         key=found.key,
-        files=ScanFiles(str(found.path), stamp, processing.repair_encoder),
+        files=ScanFiles(str(found.path), stamp, scan.lines, processing.repair_encoder),
         lines=scan.lines,
         width=scan.rig.width_px,
         matched=isinstance(scan.images, StereoPair),
-        cell_bytes=scan.left.shape[2] * scan.left.dtype.itemsize + 13,  # height 4, valid 1, source 8
+        # height 4, valid 1, source twice its type
+        cell_bytes=scan.left.shape[2] * scan.left.dtype.itemsize + 5 + 2 * source_dtype(scan.lines).itemsize,
         calibration=calibration,
         grid=grid,
-        correction=replace(processing.correction, strip_rows=_strip_rows(scan, grid, processing)),
+        correction=replace(processing.correction, strip_rows=_strip_rows(scan, frame, grid, processing)),
     )
 
 
-def rows_for_memory(width: int, halo_lines: int, most: int, memory_bytes: int) -> int:
+def rows_for_memory(width: int, halo_lines: float, most: int, memory_bytes: int, *, lines_per_row: float = 1.0) -> int:
     """Rows of a product that a worker can compute at once: ``most`` if they fit, else a power of two times the minimum.
 
     Args:
-        halo_lines: lines that every strip reads beyond its rows.
+        halo_lines: lines that every strip reads beyond those of its rows.
 
     Raises:
         ValueError: not even the minimum fits.
     """
-    room = (memory_bytes - IDLE_BYTES) // (_CORRECTION_BYTES_PER_PX * width) - halo_lines
+    room = ((memory_bytes - IDLE_BYTES) // (_CORRECTION_BYTES_PER_PX * width) - halo_lines) / lines_per_row
     rows = min(_MIN_ROWS, most)
     if room < rows:
-        needed = IDLE_BYTES + (rows + halo_lines) * width * _CORRECTION_BYTES_PER_PX
+        needed = IDLE_BYTES + round(rows * lines_per_row + halo_lines) * width * _CORRECTION_BYTES_PER_PX
         raise ValueError(
             f"a worker needs {needed >> 20} MB for {rows} rows of {width} px, it may take {memory_bytes >> 20} MB"
         )
@@ -116,19 +121,21 @@ def rows_for_memory(width: int, halo_lines: int, most: int, memory_bytes: int) -
     return rows
 
 
-def _strip_rows(scan: Scan, grid: ProductGrid, processing: Processing) -> int:
+def _strip_rows(scan: Scan, frame: ProductFrame, grid: ProductGrid, processing: Processing) -> int:
     """Rows of a product's strips; checks that matching fits the memory of a worker too."""
-    most = processing.correction.strip_rows
-    if processing.worker_memory_mb is None:
-        return most
-    memory_bytes = processing.worker_memory_mb * 2**20
+    config, limit_mb = processing.correction, processing.worker_memory_mb
+    memory_bytes = psutil.virtual_memory().total if limit_mb is None else limit_mb * 2**20
     needed = _matching_bytes(scan, processing.disparity) if isinstance(scan.images, StereoPair) else 0
-    if needed > memory_bytes:
-        problem = f"matching its strips needs {needed >> 20} MB, a worker may take {processing.worker_memory_mb} MB"
+    if limit_mb is not None and needed > memory_bytes:
+        problem = f"matching its strips needs {needed >> 20} MB, a worker may take {limit_mb} MB"
         raise FileFormatError(scan.path, problem)
-    halo = max(grid.rows - scan.lines, 0)  # the skew of a line, which every strip has to read beyond its rows
+    # Lines grow evenly with the rows; what is there beyond is the skew of a line.
+    most, least = config.strip_rows, min(_MIN_ROWS, config.strip_rows)
+    lines_of_least, lines_of_most = (most_lines(frame, grid, config, rows) for rows in (least, most))
+    lines_per_row = max(1.0, (lines_of_most - lines_of_least) / max(most - least, 1))
+    halo, width = max(lines_of_least - least * lines_per_row, 0), max(scan.rig.width_px, grid.columns)
     try:
-        return rows_for_memory(scan.rig.width_px, halo, most, memory_bytes)
+        return rows_for_memory(width, halo, most, memory_bytes, lines_per_row=lines_per_row)
     except ValueError as error:
         raise FileFormatError(scan.path, str(error)) from error
 

@@ -12,6 +12,7 @@ from lsvision.io import ProductLayout, check_product, read_product, read_scan
 from lsvision.io.atomic import check_replaceable
 from lsvision.io.inside import path_inside
 from lsvision.io.product.layout import ROOT_METADATA
+from lsvision.stages.correction.grid import source_dtype
 from lsvision.stages.correction.uncertainty import drift_per_metre
 
 _LONGEST_NAME = 200  # a product that is written has 48 characters more, and disks take 255
@@ -67,6 +68,7 @@ def product_layout(planned: PlannedScan, processing: Processing, input_sha256: s
             "key": key,
         },
         uncertainty=planned.correction.uncertainty,
+        source_dtype=source_dtype(planned.lines),
     )
 
 

@@ -1,10 +1,13 @@
 """The pieces of work of which products are made: plain data in, plain data out, results in files.
 
 Each writes chunks, or a folder, that no other writes, and the same bits however often and wherever it runs. So a piece
-that was lost half-way, or ran twice, does no harm.
+that was lost half-way, or ran twice, does no harm. Each that reads a scan raises where the scan's files were not the
+planned ones before and after: what is recorded was made from those.
 """
 
 import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -15,7 +18,7 @@ import torch
 from lsvision.archive.depth_store import open_depth_store, remove_partial_chunks, write_depth
 from lsvision.archive.identity import ScanFiles
 from lsvision.archive.product import damage_of, is_finished
-from lsvision.errors import LsvisionError
+from lsvision.errors import LsvisionError, ScanChangedError
 from lsvision.io import (
     MeasuredCells,
     ProductRows,
@@ -30,7 +33,7 @@ from lsvision.stages.correction.correct import Correction
 from lsvision.stages.correction.grid import plan_product
 from lsvision.stages.disparity.config import DisparityConfig
 from lsvision.stages.disparity.depth import depth_of
-from lsvision.types import Motion, Scan
+from lsvision.types import Motion, ProductGrid, Scan
 
 
 class Work(Protocol):
@@ -79,7 +82,8 @@ class HashInput:
 
     def run(self) -> InputHash:
         """Read every byte."""
-        return InputHash(scan_sha256(self.scan.path))
+        with _planned_files(self.scan):
+            return InputHash(scan_sha256(self.scan.path))
 
 
 @dataclass(frozen=True)
@@ -94,10 +98,10 @@ class MatchStrip:
 
     def run(self) -> StripResult:
         """Match the strip."""
-        scan = _open_scan(self.scan)
         start = self.number * self.config.work_lines
-        stop = min(start + self.config.work_lines, scan.lines)
-        depth = depth_of(scan, self.config).read(start, stop)
+        stop = min(start + self.config.work_lines, self.scan.lines)
+        with _planned_files(self.scan):
+            depth = depth_of(_open_scan(self.scan), self.config).read(start, stop)
         with naming_full_disk(self.depth_store):
             write_depth(self.depth_store, start, depth, with_sigma=self.with_sigma)
         return StripResult(stop - start, MeasuredCells(int(torch.isfinite(depth.z).sum())))
@@ -116,6 +120,7 @@ class CorrectionInput:
     n: tuple[float, ...]
     covariance: tuple[tuple[float, ...], ...]
     config: CorrectionConfig
+    grid: ProductGrid
 
 
 @dataclass(frozen=True)
@@ -128,9 +133,10 @@ class CorrectStrip:
 
     def run(self) -> StripResult:
         """Correct the rows."""
-        correction = _open_correction(self.source)
-        start = self.number * correction.config.strip_rows
-        strip = correction.strip((start, min(start + correction.config.strip_rows, correction.grid.rows)))
+        step, rows = self.source.config.strip_rows, self.source.grid.rows
+        start = self.number * step
+        with _planned_files(self.source.scan):
+            strip = _open_correction(self.source).strip((start, min(start + step, rows)))
         with naming_full_disk(self.product.final):
             _open_product(self.product.working).write(strip)
         return StripResult(len(strip.height), MeasuredCells.of(strip.height, strip.valid))
@@ -172,10 +178,32 @@ class VerifyProduct:
         return ProductState(damage_of(self.product, self.measured_cells))
 
 
+@contextmanager
+def _planned_files(files: ScanFiles) -> Iterator[None]:
+    """Read a scan within the block; an error where it was not the planned one before and after.
+
+    What was kept of it in memory is dropped then: it may be of either content.
+    """
+    global _opened
+    try:
+        files.check_unchanged()
+        try:
+            yield
+        finally:
+            files.check_unchanged()  # what was wrong with the files is the change's fault then
+    except ScanChangedError:
+        _open_scan.cache_clear()
+        _opened = threading.local()  # that of every thread
+        raise
+
+
 # Neighbouring strips of a scan share the parts of the files that were decoded last.
 @lru_cache(maxsize=2)
 def _open_scan(files: ScanFiles) -> Scan:
-    return read_scan(files.path, repair_encoder=files.repair_encoder)
+    scan = read_scan(files.path, repair_encoder=files.repair_encoder)
+    if scan.lines != files.lines:
+        raise ScanChangedError(files.path)
+    return scan
 
 
 def _open_correction(source: CorrectionInput) -> Correction:
@@ -184,7 +212,9 @@ def _open_correction(source: CorrectionInput) -> Correction:
         scan = _open_scan(source.scan)
         depth = open_depth_store(source.depth_store) if source.depth_store else depth_of(scan, source.disparity)
         motion = Motion(*(torch.tensor(values, dtype=torch.float64) for values in (source.n, source.covariance)))
-        _opened.correction = Correction(scan, depth, motion, source.config, plan_product(scan, motion, source.config))
+        if plan_product(scan, motion, source.config) != source.grid:
+            raise ScanChangedError(source.scan.path)
+        _opened.correction = Correction(scan, depth, motion, source.config, source.grid)
         _opened.source = source
     correction: Correction = _opened.correction
     return correction

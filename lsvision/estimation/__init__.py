@@ -17,7 +17,7 @@ from lsvision.estimation.information import (
     cramer_rao_bound,
     fisher_information,
     marginal_information,
-    weighed_directions,
+    principal_directions,
 )
 from lsvision.estimation.joint import Info, Linearise, Posterior, Rows, iterated_update, measurement, whitened_rows
 from lsvision.estimation.least_squares import LeastSquares, levenberg_marquardt
@@ -52,6 +52,7 @@ __all__ = [
     "nees",
     "nis",
     "predict",
+    "principal_directions",
     "product",
     "recentre",
     "slr",
@@ -59,6 +60,5 @@ __all__ = [
     "solve_upper",
     "update",
     "upper_root",
-    "weighed_directions",
     "whitened_rows",
 ]

@@ -1,4 +1,4 @@
-"""Fisher information, Cramér-Rao bound, and which directions of a parameter the data weigh more than the prior.
+"""Fisher information, Cramér-Rao bound, and the directions of a posterior against its prior.
 
 Source: Bar-Shalom, Li & Kirubarajan 2001, Estimation with Applications to Tracking and Navigation, sec. 2.7.
 """
@@ -50,7 +50,7 @@ def cramer_rao_bound(
 
 @dataclass(frozen=True)
 class Directions:
-    """Directions in which data and an isotropic prior add up independently, the weakest first.
+    """Directions in which a posterior is independent, the weakest first.
 
     ``vectors`` are unit vectors as rows, their largest component positive; ``share`` is the posterior sigma over the
     prior's along each, 1 where the data contribute nothing.
@@ -65,9 +65,9 @@ class Directions:
         return self.vectors[..., 0, :]
 
 
-def weighed_directions(information: Float[Tensor, "*batch state state"], prior_sigma: float) -> Directions:
-    """How far data of a given information narrow an isotropic prior, direction by direction."""
-    weight, columns = torch.linalg.eigh(information * prior_sigma**2)
-    vectors = columns.mT
+def principal_directions(covariance: Float[Tensor, "*batch state state"], prior_sigma: float) -> Directions:
+    """The principal axes of a posterior in units of an isotropic prior, the widest first."""
+    variance, columns = torch.linalg.eigh(covariance)
+    vectors = columns.mT.flip(-2)
     largest = vectors.gather(-1, vectors.abs().argmax(-1, keepdim=True))
-    return Directions(vectors * largest.sign(), (1.0 + weight.clamp(min=0.0)).rsqrt())
+    return Directions(vectors * largest.sign(), variance.flip(-1).clamp(min=0.0).sqrt() / prior_sigma)

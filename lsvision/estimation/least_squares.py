@@ -15,6 +15,8 @@ from lsvision.estimation.linalg import apply, solve_upper, upper_root
 
 _FIRST_DAMPING = 1e-6  # of the Jacobian's columns, scaled to unit length
 _LARGEST_DAMPING = 1e8
+# Relative rounding of a sum of squares: a step that changes less than that is as good as one that lowers it.
+_ROUNDING = 1e-12
 
 
 @dataclass(frozen=True)
@@ -50,7 +52,7 @@ def levenberg_marquardt(
         step = _damped_step(jacobian, values, damping)
         trial = state + step
         trial_values = residual(trial)
-        better = running & (trial_values.square().sum(-1) <= values.square().sum(-1))
+        better = running & (trial_values.square().sum(-1) <= (1 + _ROUNDING) * values.square().sum(-1))
         state = torch.where(better[..., None], trial, state)
         values = torch.where(better[..., None], trial_values, values)
         iterations = iterations + running

@@ -92,6 +92,7 @@ def _summary(calibration: Calibration) -> dict:
         "reasons": list(calibration.reasons),
         "notes": list(calibration.notes),
         "noise_scale": calibration.noise_scale,
+        "errors_along_scan": [asdict(error) for error in calibration.errors_along_scan],
         "n": calibration.motion.n.tolist(),
         "sigma": calibration.motion.sigma.tolist(),
         "stretch": calibration.motion.stretch,

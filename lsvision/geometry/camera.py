@@ -17,6 +17,9 @@ from torch import Tensor
 
 from lsvision.types import Rig
 
+# Range of disparities over the width of a line, of the 3DPIXA (Wang et al. 2024, Table 1).
+_SHARP_SHARE = 330 / 7142
+
 Camera = Literal["left", "right"]
 Number = TypeVar("Number", float, Tensor)
 
@@ -113,6 +116,14 @@ def depth_sigma(rig: Rig, z: Float[Tensor, "*batch"], disparity_sigma_px: Tensor
 def depth_step_mm(rig: Rig, disparity_px: float) -> float:
     """Change of depth, mm, that a change of disparity means at the plane of zero disparity."""
     return disparity_px * zero_disparity_mm(rig) ** 2 / (focal_length_px(rig) * rig.baseline_mm)
+
+
+def sharp_depth_mm(rig: Rig) -> float:
+    """Depth, mm, in which a rig usually sees sharp: no rig file says it, so it is the 3DPIXA's share of the field.
+
+    That is 330 px of disparity on a line of 7142 px: 52 mm of depth for a field of 500 mm.
+    """
+    return depth_step_mm(rig, _SHARP_SHARE * rig.width_px)
 
 
 def project(

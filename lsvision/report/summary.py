@@ -21,6 +21,7 @@ def calibration_summary(calibration: Calibration) -> str:
         f"  noise        {math.sqrt(calibration.noise_scale):.2g} times the corners' stated sigmas",
         f"  drift        {drift_in_words(motion)}",
     ]
+    lines += [f"  allowed for  {error.in_words}" for error in calibration.errors_along_scan]
     lines += [f"  because      {reason}" for reason in calibration.reasons if reason != observability.advice]
     lines += [f"  note         {note}" for note in calibration.notes]
     unknown = [direction for direction in observability.directions if not direction.observed]

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from lsvision.image.board.detect import detect_board
+from lsvision.image.board.search import search_board
 from lsvision.image.planes import fit_local_planes
 from lsvision.types import Board, LineImage, ProductGrid
 
@@ -29,7 +29,7 @@ def measure_board(color: LineImage, height: LineImage, grid: ProductGrid, board:
 
     Returns None where the product shows no board.
     """
-    corners = detect_board(color, board)
+    corners = search_board(color, board, grid.pitch_mm)
     if corners is None:
         return None
     half = max(3, round(board.square_mm / grid.pitch_mm))

@@ -34,6 +34,7 @@ class PointRuns:
     iterations: Int[Tensor, " runs"]
     converged: Bool[Tensor, " runs"]
     noise_scale: Float[Tensor, " runs"]
+    along_scan_rms_mm: Float[Tensor, "runs 3"]
     info: Int[Tensor, " runs"]
 
     @classmethod
@@ -44,7 +45,7 @@ class PointRuns:
             torch.cat([path, path[-1:].expand(longest - len(path), -1)])
             for path in (batch.rmse_path_mm for batch in batches)
         ]
-        fields = ("n", "covariance", "iterations", "converged", "noise_scale", "info")
+        fields = ("n", "covariance", "iterations", "converged", "noise_scale", "along_scan_rms_mm", "info")
         return cls(
             rmse_path_mm=torch.cat(paths, dim=1),
             **{name: torch.cat([getattr(batch, name) for batch in batches]) for name in fields},

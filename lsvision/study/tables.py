@@ -31,7 +31,8 @@ def points_table(
     ``rms_``, ``bias_`` and ``std_`` are those of the error of each component of n, ``sigma_`` is the mean sigma that
     the calibrations state, ``bound_`` the Cramér-Rao bound, prior included. ``error_over_bound`` is the root of the
     mean squared error in units of the bound, over all components: 1 for an efficient method. ``nees`` is 3 where the
-    stated covariance is right.
+    stated covariance is right. ``along_scan`` is the share of runs that found errors along the scan, and
+    ``along_scan_rms_mm`` their mean size in the component where they are largest.
     """
     rows = []
     for index, (conditions, exact) in enumerate(zip(points, corners, strict=True)):
@@ -81,6 +82,8 @@ def _run_rows(index: int, conditions: Conditions, corners: ExactCorners, runs: P
         "rmse_after_mm": runs.rmse_path_mm[-1],
         "nees": normalised,
         "noise_scale": runs.noise_scale,
+        "along_scan": (runs.along_scan_rms_mm > 0).any(-1),
+        "along_scan_rms_mm": runs.along_scan_rms_mm.amax(-1),
         "iterations": runs.iterations,
         "converged": runs.converged,
         "prior_dominated": (widest >= OBSERVED_SHARE) & ~failed,
@@ -95,7 +98,8 @@ def _bound(corners: ExactCorners, conditions: Conditions) -> Tensor:
 
 
 def _means(of_point: polars.DataFrame, solved: polars.DataFrame) -> dict[str, float]:
-    names = ("rmse_before_mm", "rmse_after_mm", "nees", "noise_scale", "converged", "prior_dominated")
+    names = ["rmse_before_mm", "rmse_after_mm", "nees", "noise_scale", "along_scan", "along_scan_rms_mm"]
+    names += ["converged", "prior_dominated"]
     used = polars.col("iterations").cast(polars.Float64).mean().alias("iterations_used")
     means = solved.select(polars.col(names).cast(polars.Float64).mean(), used).row(0, named=True)
     return {**means, "failed": float(of_point["failed"].to_numpy().mean())}

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from lsvision.estimation import cramer_rao_bound, fisher_information, marginal_information, weighed_directions
+from lsvision.estimation import cramer_rao_bound, fisher_information, marginal_information, principal_directions
 from tests.estimation.models import random, random_covariance
 
 
@@ -37,7 +37,8 @@ def test_directions_come_weakest_first_with_their_share_of_the_prior():
     """Information 0, 3 and 99 prior weights: posterior sigma 1, 1/2 and 1/10 of the prior's."""
     turn = torch.linalg.qr(random(3, 3)).Q
     information = turn @ torch.diag(torch.tensor([3.0, 99.0, 0.0]).double()) @ turn.mT / 0.05**2
-    weighed = weighed_directions(information, 0.05)
+    posterior = torch.linalg.inv(information + torch.eye(3).double() / 0.05**2)
+    weighed = principal_directions(posterior, 0.05)
     vectors = weighed.vectors
     assert weighed.share.tolist() == pytest.approx([1.0, 0.5, 0.1])
     expected = turn[:, [2, 0, 1]].mT

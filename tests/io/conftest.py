@@ -10,6 +10,7 @@ from lsvision.io import NewScan, write_scan
 from lsvision.types import (
     BoardFit,
     Calibration,
+    ErrorAlongScan,
     Iteration,
     Motion,
     Observability,
@@ -77,5 +78,6 @@ def calibration(small_rig: Rig) -> Calibration:
         verdict="inconsistent",
         reasons=("scan b ran 3.0 % faster than a",),
         noise_scale=2.5,
+        errors_along_scan=(ErrorAlongScan("x", 0.03, 230.0), ErrorAlongScan("travel", 0.01, 61.5)),
         provenance=Provenance("0.1.0", "ab" * 32, (("scans/a", "cd" * 32),)),
     )

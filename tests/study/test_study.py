@@ -40,9 +40,9 @@ PLACINGS = {
 POINT = Conditions("two", angle_x_deg=2.0, angle_z_deg=1.5, stretch=1.0246)
 
 
-def runs_of(rig, points, *, runs, batch=32, threads=1, seed=0):
+def runs_of(rig, points, *, runs, batch=32, threads=1, seed=0, config=None):
     corners = [exact_corners(rig, BOARD, PLACINGS, point) for point in points]
-    found = run_points(points, corners, CalibrationConfig(), Sampling(runs, batch, seed, threads))
+    found = run_points(points, corners, config or CalibrationConfig(), Sampling(runs, batch, seed, threads))
     return corners, found
 
 
@@ -54,11 +54,14 @@ def table_of(rig, points, **options):
 
 def test_the_same_seed_gives_the_same_tables_for_any_batch_and_threads(rig):
     points = [POINT, dataclasses.replace(POINT, boards="one"), dataclasses.replace(POINT, vibration_mm=0.5)]
-    reference = table_of(rig, points, runs=70)
+    # The search for errors along the scan goes problem by problem, and is left out as it takes its time.
+    config = CalibrationConfig(correlated_odds=math.inf)
+    reference = table_of(rig, points, runs=70, config=config)
     for batch, threads in ((1, 2), (7, 1), (64, 2), (100, 1)):
-        for table, other in zip(reference, table_of(rig, points, runs=70, batch=batch, threads=threads), strict=True):
+        others = table_of(rig, points, runs=70, batch=batch, threads=threads, config=config)
+        for table, other in zip(reference, others, strict=True):
             assert table.equals(other)
-    assert not reference[0].equals(table_of(rig, points, runs=70, seed=1)[0])
+    assert not reference[0].equals(table_of(rig, points, runs=70, seed=1, config=config)[0])
 
 
 def test_a_run_is_a_calibration_of_its_own_corners(rig):
@@ -129,13 +132,15 @@ def points_truth(runs):
     return runs["n3"] - runs["error_n3"]
 
 
-def test_two_steps_contract_slowly_and_the_joint_update_at_once(rig):
+def test_two_steps_contract_to_a_third_and_the_joint_update_at_once(rig):
+    """Of the RMSE, down to what the error of n3 leaves: several boards show it, and two steps hardly approach it."""
     points = [dataclasses.replace(POINT, method=method, iterations=8) for method in ("joint", "two_step")]
     _, table, iterations = table_of(rig, points, runs=4)
     joint, two_step = (iterations.filter(polars.col("point") == i)["median"].to_list() for i in (0, 1))
     assert joint[2] < 0.05
     ratios = [after / before for before, after in itertools.pairwise(two_step)]
-    assert all(0.8 < ratio < 1.0 for ratio in ratios)
+    assert all(0.3 < ratio < 0.5 for ratio in ratios[:2])
+    assert all(0.9 < ratio < 1.0 for ratio in ratios[-3:])
     assert table["converged"].to_list() == [1.0, 0.0]
 
 
@@ -147,13 +152,15 @@ def test_iterations_allowed_and_used_are_different_columns(rig):
     assert 2.0 < table["iterations_used"][1] < 6.0
 
 
-def test_unknown_vibration_shows_in_error_and_noise_scale(rig):
-    points = [POINT, dataclasses.replace(POINT, vibration_mm=0.3)]
-    _, table, _ = table_of(rig, points, runs=40)
+def test_unknown_vibration_shows_in_error_and_is_covered(rig):
+    points = [POINT, dataclasses.replace(POINT, vibration_mm=0.3, vibration_wavelength_mm=233.0)]
+    _, table, _ = table_of(rig, points, runs=20)
     quiet, shaken = table.iter_rows(named=True)
-    assert shaken["error_over_bound"] > 3 * quiet["error_over_bound"]
-    assert shaken["noise_scale"] > 10
+    assert shaken["error_over_bound"] > 2 * quiet["error_over_bound"]
     assert quiet["noise_scale"] < 1.1
+    assert (quiet["along_scan"], shaken["along_scan"]) == (0.0, 1.0)
+    assert 0.2 < shaken["along_scan_rms_mm"] < 1.0
+    assert 1.0 < shaken["nees"] < 4.5
 
 
 def test_map_is_blind_at_its_centre_and_sharpens_outwards(rig):
@@ -192,6 +199,14 @@ def test_wrong_conditions_are_named(rig):
         exact_corners(rig, BOARD, PLACINGS, dataclasses.replace(POINT, boards="three"))
     with pytest.raises(ConfigError, match="depth_sigma_mm"):
         noise_chol(dataclasses.replace(POINT, depth_sigma_mm=0.0))
+
+
+def test_study_of_a_vibration_shows_by_wavelength_whether_sigma_covers_it(command, tmp_path):
+    axes = ("axes.boards=null", "axes.vibration_wavelength_mm=[97.0,480.0]", "conditions.vibration_mm=0.1")
+    assert command("+experiment=study", *axes, "runs=2", "map_steps=2") == 0
+    points = polars.read_parquet(tmp_path / "run" / "points.parquet")
+    assert points["along_scan"].to_list() == [1.0, 1.0]
+    assert (tmp_path / "run" / "figures" / "coverage_vibration_wavelength_mm.svg").is_file()
 
 
 def test_command_writes_tables_and_report(command, tmp_path):

@@ -1,5 +1,9 @@
 """Checkerboards in images: the grid on a reduced copy, its order from the colours, its corners at full size."""
 
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+
 import cv2
 import numpy as np
 import torch
@@ -7,15 +11,46 @@ from jaxtyping import Float, UInt8
 from numpy.typing import NDArray
 from torch import Tensor
 
-from lsvision.image.board.lattice import find_saddle_grid
-from lsvision.image.board.order import order_grid
+from lsvision.image.board.lattice import SeenLattice, find_saddle_lattice
+from lsvision.image.board.order import order_grids, square_contrast
+from lsvision.image.board.placement import LatticeView, place_board
 from lsvision.image.board.refine import DetectedCorners, refine_grid
 from lsvision.image.brightness import gray, gray_bytes
 from lsvision.types import Board, LineImage, TensorImage
 
 _REDUCED_WIDTH = 900  # columns in which the coarse search runs: squares of a full-field board still have 40 px
 _REDUCED_RADIUS = 6  # of windows of the reduced copy, px
+_RIM_PX = 8  # of the reduced copy: nearer to its rim a saddle may be missed
 _REDUCE_LINES = 64  # as many as stay in the processor's cache
+
+
+@dataclass(frozen=True)
+class SeenBoard:
+    """A board on the reduced copy of an image: its lattice, before it is known which corner is which."""
+
+    lattice: SeenLattice
+    brightness: Float[Tensor, "lines width"]
+    factor: int
+
+    def in_image(self) -> SeenLattice:
+        """The lattice in px of the whole image, good to some tenths of a pixel of the copy."""
+        return self.lattice.enlarged(self.factor)
+
+    def with_nodes(self, lattice: SeenLattice) -> "SeenBoard":
+        """The same corners, counted as those of another lattice are."""
+        return dataclasses.replace(self, lattice=SeenLattice(lattice.node, self.lattice.position))
+
+    def black_parity(self) -> int:
+        """0 where the square from corner (0, 0) to (1, 1) is black, 1 where it is white."""
+        first, last = self.lattice.node.amin(0), self.lattice.node.amax(0)
+        x, y = (torch.arange(int(low), int(high) + 1) for low, high in zip(first, last, strict=True))
+        grid = self.lattice.to_image()(torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1).double())
+        first_is_white = square_contrast(grid, self.brightness) < 0
+        return (int(first.sum()) + first_is_white) % 2
+
+    def view(self) -> LatticeView:
+        """For the search of the board's place on the lattice."""
+        return LatticeView(self.lattice, (self.brightness.shape[0], self.brightness.shape[1]), _RIM_PX)
 
 
 def detect_board(image: LineImage, board: Board, *, mirrored: bool = False) -> DetectedCorners | None:
@@ -28,17 +63,44 @@ def detect_board(image: LineImage, board: Board, *, mirrored: bool = False) -> D
     Returns:
         Corners in the order of ``Board.corner_points``, or None where there is no board.
     """
+    seen = look_for_board(image, board)
+    located = locate_corners([image], [seen], board, mirrored=mirrored) if seen else None
+    return located[0] if located else None
+
+
+def look_for_board(image: LineImage, board: Board) -> SeenBoard | None:
+    """The board's lattice on a reduced copy of an image; None where there is none."""
     factor = max(1, round(image.shape[1] / _REDUCED_WIDTH))
     reduced = reduce_image(image, factor)
-    grid = find_grid(reduced, board.inner)
-    if grid is None:
+    lattice = find_lattice(reduced, board.inner)
+    return SeenBoard(lattice, reduced, factor) if lattice is not None else None
+
+
+def locate_corners(
+    images: Sequence[LineImage], seen: Sequence[SeenBoard], board: Board, *, mirrored: bool = False
+) -> list[DetectedCorners] | None:
+    """Corners of one board in one image or several, to a fraction of a pixel, in the order of ``Board.corner_points``.
+
+    Args:
+        seen: the board in each of the images, with lattices that count from the same corner along the same axes.
+
+    Returns:
+        Corners of each image; None where too few of a board are seen.
+    """
+    grids = place_board([found.view() for found in seen], board.inner)
+    if grids is None:
         return None
-    ordered = order_grid(grid, reduced, mirrored=mirrored)
-    if factor > 1:
+    grids = order_grids(grids, [found.brightness for found in seen], mirrored=mirrored)
+    return [_refined(image, found, grid) for image, found, grid in zip(images, seen, grids, strict=True)]
+
+
+def _refined(image: LineImage, seen: SeenBoard, grid: Tensor) -> DetectedCorners:
+    if seen.factor > 1:
         # A tenth of a pixel of the copy is already a pixel of the image; the fit of the copy is better than that.
-        coarse = refine_grid(TensorImage(reduced[..., None]), ordered, largest_radius=_REDUCED_RADIUS, plain=True)
-        ordered = torch.where(coarse.valid[:, None], coarse.position, ordered.reshape(-1, 2)).reshape(ordered.shape)
-    return refine_grid(image, (ordered + 0.5) * factor - 0.5)
+        copy = TensorImage(seen.brightness[..., None])
+        coarse = refine_grid(copy, grid, largest_radius=_REDUCED_RADIUS, plain=True)
+        grid = torch.where(coarse.valid[:, None], coarse.position, grid.reshape(-1, 2)).reshape(grid.shape)
+    return refine_grid(image, (grid + 0.5) * seen.factor - 0.5)
 
 
 def reduce_image(image: LineImage, factor: int) -> Float[Tensor, "lines width"]:
@@ -59,14 +121,8 @@ def reduce_image(image: LineImage, factor: int) -> Float[Tensor, "lines width"]:
     return torch.from_numpy(np.concatenate(blocks)).float() if blocks else torch.zeros(0, kept // factor)
 
 
-def find_grid(
-    brightness: Float[Tensor, "lines width"], inner: tuple[int, int]
-) -> Float[Tensor, "rows columns 2"] | None:
-    """Inner corners of a board as a grid of (u, v) px, columns along the longer side; None where none is seen.
-
-    Where a board is partly hidden or beyond the image, the grid continues where its corners would be. The order along
-    either side, and so the handedness, is undetermined: ``order_grid`` settles it.
-    """
+def find_lattice(brightness: Float[Tensor, "lines width"], inner: tuple[int, int]) -> SeenLattice | None:
+    """Corners of a board, all or those that are seen, as nodes of a lattice; None where no board is seen."""
     if min(brightness.shape) < 2 * max(inner):
         return None
     picture = stretch_to_bytes(brightness).numpy()
@@ -78,7 +134,9 @@ def find_grid(
             picture, inner, flags=cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
         )
     # Both need every corner, and miss boards at some angles and shears.
-    return _as_grid(corners, inner) if found else find_saddle_grid(brightness, inner)
+    if found:
+        return SeenLattice.of_grid(_as_grid(corners, inner))
+    return find_saddle_lattice(brightness, inner[0] * inner[1])
 
 
 def stretch_to_bytes(brightness: Float[Tensor, "lines width"]) -> UInt8[Tensor, "lines width"]:

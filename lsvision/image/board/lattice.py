@@ -1,9 +1,8 @@
-"""A checkerboard's grid from the saddles of an image: for boards partly hidden, cut off, or strongly sheared."""
+"""The lattice of a checkerboard from the saddles of an image: of boards partly hidden, cut off, or sheared."""
 
 from dataclasses import dataclass
 
 import torch
-import torch.nn.functional as F  # noqa: N812
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
@@ -18,9 +17,7 @@ _RADII = (1.6, 2.6, 3.6, 5.0, 7.0, 10.0, 15.0, 25.0, 40.0)  # squares around the
 _OFF_GRID = 0.25  # squares
 _ALIGNED = 0.3
 _CURVED = 24  # saddles that are enough for a quadratic map
-_EVEN = (0.65, 1.5)  # of the median corner
-_SEEN_SHARE = 0.5  # of the board's corners
-_STRAY_SHARE = 0.1  # of the grid's saddles that may lie beyond the board
+_EVEN = (0.65, 1.6)  # of the median corner
 
 
 @dataclass(frozen=True)
@@ -65,44 +62,59 @@ class Lattice:
 
 
 @dataclass(frozen=True)
-class Placement:
-    """Column and row of each saddle on the board, and how many of the board's corners were seen."""
+class SeenLattice:
+    """Corners of chequered squares as an image shows them: (u, v) px, and whole squares from any one of them.
 
-    node: Int[Tensor, "saddles 2"]
-    seen: int
+    Which way the two axes of the nodes run, and which corner of a board any of them is, is not known.
+    """
 
-    def on_board(self, inner: tuple[int, int]) -> Bool[Tensor, " saddles"]:
-        """Saddles that are corners of the board."""
-        return ((self.node >= 0) & (self.node < self.node.new_tensor(inner))).all(-1)
+    node: Int[Tensor, "corners 2"]
+    position: Float[Tensor, "corners 2"]
+
+    @classmethod
+    def of_grid(cls, grid: Float[Tensor, "rows columns 2"]) -> "SeenLattice":
+        """A whole grid, of which all corners were seen."""
+        y, x = torch.meshgrid(torch.arange(grid.shape[0]), torch.arange(grid.shape[1]), indexing="ij")
+        return cls(torch.stack([x, y], dim=-1).reshape(-1, 2), grid.reshape(-1, 2).double())
+
+    def turned(self, axes: Int[Tensor, "2 2"], origin: Int[Tensor, "2"]) -> "SeenLattice":
+        """The same corners counted along other axes: node ``axes @ node + origin``."""
+        return SeenLattice(self.node @ axes.mT + origin, self.position)
+
+    def enlarged(self, factor: int) -> "SeenLattice":
+        """The same corners in the image of which this was a reduced copy."""
+        return SeenLattice(self.node, (self.position + 0.5) * factor - 0.5)
+
+    def steps(self) -> Float[Tensor, "2 2"]:
+        """Mean steps from node to node along either axis, as columns, px."""
+        return QuadraticMap.fitted(self.node.double(), self.position, 3).coefficients[1:3].mT
+
+    def to_image(self) -> QuadraticMap:
+        """Where the lattice continues: positions of nodes, by least squares."""
+        return QuadraticMap.fitted(self.node.double(), self.position, 6 if len(self.node) >= _CURVED else 3)
 
 
-def find_saddle_grid(
-    brightness: Float[Tensor, "lines width"], inner: tuple[int, int]
-) -> Float[Tensor, "rows columns 2"] | None:
-    """Inner corners of a board of which at least half are seen, as (u, v) px; the others where the grid continues.
+def find_saddle_lattice(brightness: Float[Tensor, "lines width"], corners: int) -> SeenLattice | None:
+    """The largest lattice of chequered squares in an image; None where there is none.
 
     Saddles are linked to a lattice: neighbours along the squares' edges have opposite curvatures, which no texture has.
-    From a few seeds the lattice is fitted to ever wider surroundings. Where a part of the board is beyond the image,
-    the grid may be shifted along the lattice by whole squares.
+    From a few seeds the lattice is fitted to ever wider surroundings.
 
     Args:
         brightness: of an image in which squares have eight pixels or more.
-        inner: corners along the longer side and along the shorter.
+        corners: of the whole board.
     """
-    corners = inner[0] * inner[1]
     saddles = find_saddle_points(brightness, _CANDIDATES * corners, int(_EXPECTED_SHARE * corners))
-    if len(saddles.points) < _SEEN_SHARE * corners:
-        return None
     seeds = range(min(_SEEDS, len(saddles.points)))
     lattices = [lattice for seed in seeds if (lattice := grow_lattice(saddles, seed)) is not None]
     if not lattices:
         return None
     lattice = max(lattices, key=lambda lattice: lattice.count)
-    # Where squares end at the board's rim three quadrants are white, which is half as even as a corner of four squares;
-    # saddles of noise and of fine texture are more even than any.
+    # Where squares end at the board's rim three quadrants are white, which is a third as even as a corner of four
+    # squares; saddles of noise and of fine texture are more even than any.
     share = saddles.evenness / saddles.evenness[lattice.on_grid].median()
     corner = lattice.on_grid & (share > _EVEN[0]) & (share < _EVEN[1])
-    return board_on_lattice(saddles.points[corner], lattice.node[corner], inner)
+    return SeenLattice(lattice.node[corner].long(), saddles.points[corner])
 
 
 def grow_lattice(saddles: SaddlePoints, seed: int) -> Lattice | None:
@@ -143,33 +155,3 @@ def _nodes_within(position: Tensor, alignment: Tensor, radius: float) -> Lattice
     on_grid = ((position - node).abs() < _OFF_GRID).all(-1)
     on_grid &= torch.where(even, alignment, -alignment) > _ALIGNED
     return Lattice(node, on_grid & (position.abs() <= radius).all(-1))
-
-
-def board_on_lattice(
-    points: Float[Tensor, "saddles 2"], node: Float[Tensor, "saddles 2"], inner: tuple[int, int]
-) -> Float[Tensor, "rows columns 2"] | None:
-    """The board's grid where most of its corners lie on nodes with a saddle; None where they are too few."""
-    node = (node - node.amin(0)).long()
-    # The board's longer side may run along either axis of the lattice.
-    placement = max((_best_placement(turned, inner) for turned in (node, node.flip(-1))), key=lambda place: place.seen)
-    on_board = placement.on_board(inner)
-    enough = placement.seen >= _SEEN_SHARE * inner[0] * inner[1]
-    if not enough or int((~on_board).sum()) > _STRAY_SHARE * len(node):
-        return None
-    corner, seen = placement.node[on_board], points[on_board]
-    y, x = torch.meshgrid(torch.arange(inner[1]), torch.arange(inner[0]), indexing="ij")
-    grid = QuadraticMap.fitted(corner.double(), seen)(torch.stack([x, y], dim=-1).double())
-    grid[corner[:, 1], corner[:, 0]] = seen
-    return grid
-
-
-def _best_placement(node: Tensor, inner: tuple[int, int]) -> Placement:
-    """The board placed on nodes (saddles, 2), counted from 0, so that it covers as many as possible."""
-    columns, rows = inner
-    occupied = torch.zeros(int(node[:, 1].max()) + 1, int(node[:, 0].max()) + 1)
-    occupied[node[:, 1], node[:, 0]] = 1
-    padded = F.pad(occupied, (columns - 1, columns - 1, rows - 1, rows - 1))
-    covered = F.avg_pool2d(padded[None], (rows, columns), 1)[0] * rows * columns
-    row, column = divmod(int(covered.argmax()), covered.shape[1])
-    first_corner = node.new_tensor([column - columns + 1, row - rows + 1])
-    return Placement(node - first_corner, int(covered.max().round()))

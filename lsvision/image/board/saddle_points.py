@@ -17,7 +17,7 @@ class SaddlePoints:
     """Saddle points of an image, strongest first, float64.
 
     ``curvature`` is the Hessian of the brightness as (xx, xy, yy) of length 1. ``evenness`` is minus its determinant
-    over the squared variance around the point: it does not depend on the light.
+    over the variance around the point, 1/px⁴: it depends neither on the light nor on the contrast.
     """
 
     points: Float[Tensor, "saddles 2"]
@@ -49,7 +49,7 @@ def find_saddle_points(brightness: Float[Tensor, "lines width"], most: int, expe
     line, column = _strongest_peaks(response, most, expected).unbind(-1)
     curvature = torch.stack([field[line, column] for field in (xx, xy, yy)], dim=-1).double()
     variance = _local_variance(smooth)[line, column].double()
-    evenness = response[line, column].double() / variance.square().clamp(min=1e-6)
+    evenness = response[line, column].double() / variance.clamp(min=1e-6)
     return SaddlePoints(torch.stack([column, line], dim=-1).double(), F.normalize(curvature, dim=-1), evenness)
 
 

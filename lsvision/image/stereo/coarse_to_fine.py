@@ -90,7 +90,7 @@ def _search_quarter(quarter: GrayPair, search: Search, noise: float) -> Tensor:
         left_right_check_px=round(search.left_right_check_px / COARSEST),
         speckle_px=_COARSE_SPECKLE * search.speckle_px,
     )
-    options = RefineOptions(_QUARTER_WINDOW, iterations=1, noise=noise)
+    options = RefineOptions(_QUARTER_WINDOW, iterations=1, noise=noise, with_sigma=False)
     return refine_disparity(quarter.left, quarter.right, match_sgbm(quarter, coarse_search), options).disparity
 
 
@@ -122,8 +122,9 @@ def _search_half(
     Args:
         missing: where the quarter has no match. check_px: largest disagreement of the two views.
     """
-    options = RefineOptions(_HALF_WINDOW, iterations=1, noise=noise, largest_sigma_px=_DOUBTFUL_PX / _HALF_WINDOW)
-    near = refine_disparity(half.left, half.right, surfaces.near, options).disparity
+    options = RefineOptions(_HALF_WINDOW, iterations=1, noise=noise, with_sigma=False)
+    doubting = replace(options, largest_misfit_px=_DOUBTFUL_PX / _HALF_WINDOW)
+    near = refine_disparity(half.left, half.right, surfaces.near, doubting).disparity
     wrong, two = near.isnan(), surfaces.near > surfaces.far
     doubtful = _grown(wrong | two | missing)
     best = BestMatch.of(half, torch.where(wrong, surfaces.near, near))
@@ -131,7 +132,7 @@ def _search_half(
     best.search_around(surfaces.near, doubtful, around)
     best.search_around(surfaces.far, two, around)
     disparity = agreeing(_without_speckles(best.disparity, search.speckle_px), best.cost, check_px)
-    return _refined_where(half, disparity, doubtful, replace(options, largest_sigma_px=None))
+    return _refined_where(half, disparity, doubtful, options)
 
 
 def _search_around(search: Search) -> Search:

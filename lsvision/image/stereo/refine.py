@@ -3,11 +3,12 @@
 In the window around each block
 
 1. the right image is warped by the current disparity (``warp_cubic``),
-2. sums over the window (``Windows``) give the normal equation of the shift that fits it to the left image best,
+2. least squares give the shift that fits it to the left image best (``LeftWindows.fit``),
 3. the disparity takes this step, and after the last one
-4. the variance of the residual and the texture give the step's sigma (``_fit_blocks``).
+4. the variance of the residual and the texture give the step's sigma (``LeftWindows.certainty``).
 
-At the end implausible results are undone or dropped (``_accepted``) and blocks become pixels.
+At the end implausible results are undone or dropped (``_accepted``), the scatter of the disparities joins the sigma
+(``with_scatter``), and blocks become pixels.
 """
 
 import math
@@ -19,20 +20,18 @@ from jaxtyping import Float, Shaped
 from torch import Tensor
 
 from lsvision.image.stereo.blocks import block_side, enlarged, repeated, whole_blocks
+from lsvision.image.stereo.scatter import SigmaGains, with_scatter
+from lsvision.image.stereo.shift import Certainty, LeftWindows, explained_share
 from lsvision.image.stereo.warp import warp_cubic
 from lsvision.image.stereo.windows import Windows
 from lsvision.image.tiling import HaloRange, halo_ranges, in_parallel
 
 # The dozen intermediate images of a tile of this size stay in the processor's cache.
-_TILE_LINES, _TILE_COLUMNS = 256, 512
+_TILE_LINES, _TILE_COLUMNS = 256, 1024
 _SAME_SURFACE_PX = 0.5  # from the mean of a window
 _LARGEST_STEP_PX = 0.5
-_ROUNDING = 1.0 / 6.0  # variance of the difference of two whole grey values
-# Variance of half the difference of two neighbours over that of the residual: half of a pixel's noise variance, over
-# that of one pixel and of another which interpolation has smoothed to 0.6 of it on average.
-_SLOPE_NOISE = 0.5 / 1.6
 _NOISE_RESIDUAL = 4.0  # times the variance of the noise in one image; that of two images is twice as large
-_HOPELESS = 5.0  # times the largest sigma: beyond it a disparity is a guess, however well it fits
+_EXPLAINED = 6.25  # the largest sigma grows by so many times with the share of the grey values that the match explains
 
 
 @dataclass(frozen=True)
@@ -44,16 +43,27 @@ class RefineOptions:
         iterations: at least one.
         noise: sigma of the noise of grey values, on their scale.
         largest_change_px: a larger total change is implausible and is undone.
-        largest_sigma_px: a pixel of larger sigma is dropped unless its residual is no more than noise: ground without
-            texture gives little information, but a wrong match gives wrong information. A pixel of five times this
-            sigma is always dropped.
+        largest_sigma_px: a pixel of larger sigma is dropped where the match explains nothing of the grey values around
+            it; where it explains all, noise aside, 7.25 times as much is allowed. Infinity keeps all.
+        largest_misfit_px: a pixel whose residual is above noise, and would explain a shift by more than this, is
+            dropped: ground without texture gives little information, but a wrong match gives wrong information.
+        with_gain: brightness may differ by a factor, too, not by an offset only.
+        with_sigma: False leaves sigma unknown, which saves time, and ``largest_sigma_px`` without effect.
     """
 
     window: int
     iterations: int
     noise: float
     largest_change_px: float = 1.0
-    largest_sigma_px: float | None = None
+    largest_sigma_px: float = math.inf
+    largest_misfit_px: float = math.inf
+    with_gain: bool = False
+    with_sigma: bool = True
+
+    @property
+    def judges(self) -> bool:
+        """Whether anything depends on how certain a disparity is."""
+        return self.with_sigma or self.largest_misfit_px < math.inf
 
     def window_blocks(self, block: int) -> int:
         """Side of the window in blocks of ``block`` pixels a side."""
@@ -79,10 +89,14 @@ def refine_disparity(
     """Improve a disparity map that is good to about a pixel; NaN stays NaN.
 
     In a window around each pixel the right image, warped by the current disparity, is shifted so that it fits the left
-    one best; brightness may differ by an offset. Semi-global matching interpolates its costs, which pulls disparities
-    towards whole pixels; least squares on grey values do not. Where a window has no texture, the disparity stays.
+    one best; brightness may differ by an offset and, ``with_gain``, by a factor. Semi-global matching interpolates its
+    costs, which pulls disparities towards whole pixels; least squares on grey values do not. Where a window has no
+    texture, the disparity stays.
 
-    Sigma follows from the residuals in the window after the last step and from the texture.
+    Sigma follows from the residuals and the texture in the window, as in any least squares, and from the scatter of
+    the disparities around their mean over a window. Least squares alone count every residual as noise of its own: on
+    photographs, whose residuals are mostly other light, other blur and surfaces that are no plane, it claims 2.6 times
+    too little. The scatter is an error that has been seen.
 
     A disparity for each 2 x 2 pixels, the last ones perhaps incomplete, is refined by all pixels of the images and
     interpolated at the end: neighbouring windows share most of their pixels and add little information.
@@ -97,13 +111,12 @@ def refine_disparity(
 
     Raises:
         ValueError: the disparity has neither one value for each pixel nor one for each block.
-
-    Source: Lucas & Kanade 1981, in one dimension; Baker & Matthews 2004 for the slope of the image that is not warped.
     """
     block, (lines, width) = block_side(left, disparity), left.shape
     window = options.window_blocks(block)
-    halo = 2 * options.iterations * (window // 2) + block - 1  # interpolation reads one block further
-    gain = _sigma_gain(window, options.iterations)
+    reach = options.iterations + (1 if options.with_sigma else 0)
+    halo = 2 * reach * (window // 2) + block - 1  # interpolation reads one block further
+    gains = SigmaGains.of(window, options.iterations)
     result = RefinedDisparity(disparity.new_empty(lines, width), disparity.new_empty(lines, width))
 
     def refine_rows(rows: HaloRange) -> None:
@@ -112,27 +125,28 @@ def refine_disparity(
         for columns in halo_ranges(disparity.shape[1], _TILE_COLUMNS // block, halo):
             start = disparity[rows.outer, columns.outer]
             pixels = slice(block * columns.outer_start, block * columns.outer_stop)
-            fit = _fit_blocks(left_rows[:, pixels], right_rows, start, first_column + pixels.start, options)
-            _write_pixels(_accepted(fit, start, gain, options), block, (rows, columns), result)
+            refined = _refine_blocks(left_rows[:, pixels], right_rows, start, first_column + pixels.start, options)
+            _write_pixels(_accepted(refined, start, gains, options), block, (rows, columns), result)
 
     in_parallel(refine_rows, halo_ranges(disparity.shape[0], _TILE_LINES // block, halo))
     return result
 
 
 @dataclass(frozen=True)
-class _Fit:
-    """Disparity of the blocks of a tile, sigma of one least-squares step, and variance of the residual grey values."""
+class _Refined:
+    """Disparity of the blocks of a tile, how certain the last step was, and the windows that it used.
+
+    ``explained`` is the share of the left image's variance that the match explains. None is what nobody asks for.
+    """
 
     disparity: Tensor
-    sigma: Tensor
-    residual_variance: Tensor
+    certainty: Certainty | None
+    windows: Windows
+    explained: Tensor | None
 
 
-def _fit_blocks(left: Tensor, right: Tensor, start: Tensor, first_column: int, options: RefineOptions) -> _Fit:
+def _refine_blocks(left: Tensor, right: Tensor, start: Tensor, first_column: int, options: RefineOptions) -> _Refined:
     """Least squares in the windows of a tile, from the disparities ``start`` of its blocks on.
-
-    With s the slope of the left image, e = left - warped right and cov over a window, a change by -q fits best where
-    ``(cov(s, s) + prior) q = cov(s, e)``; an offset of brightness drops out of the covariances.
 
     Args:
         left: grey values of the tile, float32, which begin at ``first_column`` of the right image.
@@ -140,30 +154,18 @@ def _fit_blocks(left: Tensor, right: Tensor, start: Tensor, first_column: int, o
     """
     block = left.shape[0] // start.shape[0]
     windows = Windows.over(start == start, options.window_blocks(block))  # invalid where it is NaN
-    # The slope of the left image has noise independent of the right one. Interpolation smooths the right image between
-    # its pixels: a slope that shared its noise would pull disparities towards the middle between them.
-    slope = F.pad(left[:, 2:] - left[:, :-2], (1, 1)).mul_(0.5)
-    mean_slope = windows.mean(slope)
-    texture = windows.covariance(slope, slope, mean_slope, mean_slope)
-    # The variance of the window's mean of noise times slope; it keeps untextured ground where matching put it.
-    prior = 4.0 * options.noise**2 / (block * windows.size) ** 2
-    normal = texture + prior
+    equations = LeftWindows.of(left, windows, options.noise, with_gain=options.with_gain)
     disparity = torch.nan_to_num(start)
     for _ in range(options.iterations):
         disparity = _smoothed(disparity, windows)
         residual = left - warp_cubic(right, enlarged(disparity, block), first_column)
-        mean_residual = windows.mean(residual)
-        pull = windows.covariance(slope, residual, mean_slope, mean_residual)
-        step = pull / normal
-        disparity.sub_(step.clamp(-_LARGEST_STEP_PX, _LARGEST_STEP_PX))
-    variance = windows.covariance(residual, residual, mean_residual, mean_residual)
-    pixels = windows.count * block**2
-    freedom = (pixels - 2).clamp_(min=1)
-    residual_variance = torch.addcmul(variance, pull, step, value=-1).mul_(pixels).div_(freedom).clamp_(min=_ROUNDING)
-    # The noise of the slope looks like texture but carries no information.
-    normal_without_noise = texture.sub(residual_variance, alpha=_SLOPE_NOISE).clamp_(min=0).add_(prior)
-    sigma = normal.clamp(min=0).mul_(residual_variance).div_(pixels).sqrt_().div_(normal_without_noise)
-    return _Fit(disparity, sigma, residual_variance)
+        fit = equations.fit(residual)
+        disparity.sub_(fit.step.clamp(-_LARGEST_STEP_PX, _LARGEST_STEP_PX))
+    certainty = equations.certainty(residual, fit) if options.judges else None
+    explained = None
+    if certainty is not None and options.with_sigma and options.largest_sigma_px < math.inf:
+        explained = explained_share(left, windows, certainty.residual_variance, options.noise)
+    return _Refined(disparity, certainty, windows, explained)
 
 
 def _smoothed(disparity: Tensor, windows: Windows) -> Tensor:
@@ -179,34 +181,24 @@ def _zero_beyond(change: Tensor, limit: float) -> Tensor:
     return change - F.hardshrink(change, limit)
 
 
-def _sigma_gain(window: int, iterations: int) -> float:
-    """Sigma after some iterations over that of a single one.
-
-    With B the mean over a window, a step from disparities in error by e leaves ``(1 - B) B e`` of it and adds the
-    error of the step.
-    """
-    size = 8 * window * iterations
-    box = torch.zeros(size, dtype=torch.float64)
-    box[: window // 2 + 1] = box[size - window // 2 :] = 1.0 / window
-    smoothing = torch.fft.fft(box).real
-    smoothing = smoothing[:, None] * smoothing
-    result = smoothing
-    for _ in range(iterations - 1):
-        result = smoothing + (1 - smoothing) * smoothing * result
-    return float((result.square().mean() / smoothing.square().mean()).sqrt())
+def _accepted(refined: _Refined, start: Tensor, gains: SigmaGains, options: RefineOptions) -> RefinedDisparity:
+    """Disparity of blocks whose too large changes are undone, NaN where it is too uncertain, and its sigma."""
+    disparity = start + _zero_beyond(refined.disparity - start, options.largest_change_px)
+    if refined.certainty is None:
+        return RefinedDisparity(disparity, torch.full_like(disparity, torch.nan))
+    sigma = refined.certainty.sigma * gains.iterations
+    noisy = refined.certainty.residual_variance > _NOISE_RESIDUAL * options.noise**2
+    dropped = (sigma > options.largest_misfit_px).logical_and_(noisy)
+    if options.with_sigma:
+        sigma = with_scatter(sigma, disparity, refined.windows, gains)
+    if refined.explained is not None:
+        dropped.logical_or_(sigma > (_EXPLAINED * refined.explained).add_(1.0).mul_(options.largest_sigma_px))
+    return RefinedDisparity(disparity.masked_fill_(dropped, torch.nan), sigma)
 
 
-def _accepted(fit: _Fit, start: Tensor, gain: float, options: RefineOptions) -> _Fit:
-    """A fit whose too large changes are undone and whose too uncertain disparities are NaN."""
-    largest = options.largest_sigma_px or math.inf
-    sigma = fit.sigma * gain
-    mismatched = (sigma > largest).logical_and_(fit.residual_variance > _NOISE_RESIDUAL * options.noise**2)
-    dropped = mismatched.logical_or_(sigma > _HOPELESS * largest)
-    disparity = start + _zero_beyond(fit.disparity - start, options.largest_change_px)
-    return _Fit(disparity.masked_fill_(dropped, torch.nan), sigma, fit.residual_variance)
-
-
-def _write_pixels(fit: _Fit, block: int, ranges: tuple[HaloRange, HaloRange], result: RefinedDisparity) -> None:
+def _write_pixels(
+    blocks: RefinedDisparity, block: int, ranges: tuple[HaloRange, HaloRange], result: RefinedDisparity
+) -> None:
     """Write what blocks give for each of their pixels, without the halo, into the maps of the image."""
     tile = tuple(slice(block * part.start, block * part.stop) for part in ranges)
     disparity, sigma = result.disparity[tile], result.sigma[tile]
@@ -214,5 +206,5 @@ def _write_pixels(fit: _Fit, block: int, ranges: tuple[HaloRange, HaloRange], re
         slice(block * part.inner.start, block * part.inner.start + size)  # the last blocks may be incomplete
         for part, size in zip(ranges, disparity.shape, strict=True)
     )
-    disparity.copy_(enlarged(fit.disparity, block)[inner])
-    torch.add(disparity - disparity, repeated(fit.sigma, block)[inner], out=sigma)  # NaN where the disparity is
+    disparity.copy_(enlarged(blocks.disparity, block)[inner])
+    torch.add(disparity - disparity, repeated(blocks.sigma, block)[inner], out=sigma)  # NaN where the disparity is

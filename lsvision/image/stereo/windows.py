@@ -29,10 +29,14 @@ class Windows:
 
     def mean(self, values: Float[Tensor, "lines width"]) -> Float[Tensor, "rows columns"]:
         """Mean over each window of a map with a value for each block or for each pixel."""
+        return window_sum(self.reduced(values) * self.weight, self.size).div_(self.count)
+
+    def reduced(self, values: Float[Tensor, "lines width"]) -> Float[Tensor, "rows columns"]:
+        """The mean over each block of a map with a value for each block or for each pixel."""
         rows, columns = self.weight.shape
-        if values.shape != self.weight.shape:
-            values = torch.from_numpy(cv2.resize(values.numpy(), (columns, rows), interpolation=cv2.INTER_AREA))
-        return window_sum(values * self.weight, self.size).div_(self.count)
+        if values.shape == self.weight.shape:
+            return values
+        return torch.from_numpy(cv2.resize(values.numpy(), (columns, rows), interpolation=cv2.INTER_AREA))
 
     def covariance(
         self,

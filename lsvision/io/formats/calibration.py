@@ -17,6 +17,7 @@ from lsvision.types import (
     BoardFit,
     Calibration,
     CalibrationMethod,
+    ErrorAlongScan,
     Iteration,
     Motion,
     Observability,
@@ -112,7 +113,7 @@ class ProvenanceEntries(Checked):
 class CalibrationEntries(Checked):
     """The entries of ``calibration.json``; the improvement follows from the two RMSE and is accepted as it is.
 
-    Files of earlier versions lack ``verdict``, ``reasons`` and ``noise_scale``.
+    Files of earlier versions lack ``verdict``, ``reasons``, ``noise_scale`` and ``errors_along_scan``.
     """
 
     format: CalibrationFormat
@@ -129,6 +130,7 @@ class CalibrationEntries(Checked):
     reasons: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
     noise_scale: Positive = 1.0
+    errors_along_scan: tuple[ErrorAlongScan, ...] = ()
     converged: bool | None = None
     improvement: object = None
 
@@ -148,6 +150,7 @@ def write_calibration(calibration: Calibration, path: Path | str) -> None:
         "notes": list(calibration.notes),
         "converged": calibration.converged,
         "noise_scale": calibration.noise_scale,
+        "errors_along_scan": [asdict(item) for item in calibration.errors_along_scan],
         "motion": _motion_to_dict(calibration.motion),
         "rmse_before_mm": calibration.rmse_before_mm,
         "rmse_after_mm": calibration.rmse_after_mm,
@@ -175,8 +178,7 @@ def read_calibration(path: Path | str) -> Calibration:
     Raises:
         FileFormatError: an entry is missing, unknown, not finite or out of range.
     """
-    path = Path(path)
-    entries = read_entries(CalibrationEntries, read_json(path), path)
+    entries = read_entries(CalibrationEntries, read_json(path := Path(path)), path)
     observability = Observability(entries.observability.directions, entries.observability.advice)
     converged = entries.converged is not False
     return Calibration(
@@ -186,6 +188,7 @@ def read_calibration(path: Path | str) -> Calibration:
         notes=entries.notes,
         converged=converged,
         noise_scale=entries.noise_scale,
+        errors_along_scan=entries.errors_along_scan,
         motion=entries.motion.motion(path),
         rmse_before_mm=entries.rmse_before_mm,
         rmse_after_mm=entries.rmse_after_mm,
@@ -236,9 +239,8 @@ def _board_to_dict(board: BoardFit) -> dict[str, object]:
 
 
 def _verdict_of_earlier_file(converged: bool, observability: Observability) -> Verdict:
-    if not converged:
-        return "not converged"
-    return "determined" if observability.determined else "prior-dominated"
+    known: Verdict = "determined" if observability.determined else "prior-dominated"
+    return known if converged else "not converged"
 
 
 def _float64(numbers: Triple | Matrix) -> Tensor:

@@ -39,7 +39,7 @@ class ProductLayout:
 
     ``channels`` (1 or 3) and ``dtype`` (uint8 or uint16) are those of the colour image. A chunk holds ``chunk_rows``
     rows and all columns. ``metadata`` is plain data kept with the product. With ``uncertainty`` the product also holds
-    the standard deviations of its positions.
+    the standard deviations of its positions. ``source_dtype`` is that of the positions in the scan.
     """
 
     grid: ProductGrid
@@ -48,6 +48,7 @@ class ProductLayout:
     chunk_rows: int
     metadata: Mapping[str, object]
     uncertainty: bool = False
+    source_dtype: torch.dtype = torch.float32
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -67,7 +68,8 @@ def create_images(folder: Path | str, layout: ProductLayout) -> None:
     _create_image(root, layout, "color", NUMPY_DTYPES[layout.dtype], 0, layout.channels)
     _create_image(root, layout, "height", np.float32, np.nan)
     _create_image(root, layout, "valid", np.bool_, False)
-    _create_image(root, layout, "source", np.float32, np.nan, 2)
+    source = np.float64 if layout.source_dtype == torch.float64 else np.float32
+    _create_image(root, layout, "source", source, np.nan, 2)
     if layout.uncertainty:
         _create_image(root, layout, "sigma", np.float32, np.nan, 3)
 

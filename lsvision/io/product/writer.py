@@ -13,7 +13,6 @@ from torch import Tensor
 from lsvision.errors import FileFormatError
 from lsvision.image.tiling import in_parallel
 from lsvision.io.atomic import partial_folder, replace_folder
-from lsvision.io.images.bands import TORCH_DTYPES
 from lsvision.io.product.layout import ROOT_METADATA, ProductLayout, create_images, image_names, strip_images
 from lsvision.io.product.pyramid import halve
 from lsvision.types import ProductStrip
@@ -68,7 +67,7 @@ class ProductRows:
         for name, block in strip_images(strip).items():
             image = self._levels[name][0]
             shape = (len(strip.height), image.shape[-1], *image.shape[:-2])
-            dtype = torch.bool if image.dtype == np.bool_ else TORCH_DTYPES[np.dtype(image.dtype)]
+            dtype = torch.from_numpy(np.empty(0, image.dtype)).dtype
             if tuple(block.shape) != shape or block.dtype != dtype:
                 raise ValueError(f"{name}: expected {shape} {dtype}, got {tuple(block.shape)} {block.dtype}")
 

@@ -13,7 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lsvision.estimation import Posterior, apply, lower_factor, product
-from lsvision.stages.calibration.linearise import _affine_columns, point_factor
+from lsvision.stages.calibration.linearise import affine_columns, point_factor
 from lsvision.stages.calibration.problem import BoardProblem
 
 _COLUMNS = slice(3, 12)  # of pose and n, between the latents and the value
@@ -55,7 +55,7 @@ class _BoardScale:
         cls, problem: BoardProblem, posterior: Posterior, noise_scale: Float[Tensor, "*batch"], sigma: float
     ) -> "_BoardScale":
         """The size that the corners show."""
-        columns = _affine_columns(problem, posterior.mean, point_factor(posterior.mean))
+        columns = affine_columns(problem, posterior.mean, point_factor(posterior.mean))
         by_scale = columns[..., -1:].clone()
         by_scale[..., :3, :] = 0.0  # the board's centre stays
         rows = problem.affine_rows / noise_scale.sqrt()[..., None, None, None]

@@ -5,51 +5,30 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from lsvision.errors import CalibrationError, ConfigError
 from lsvision.estimation import Info, Posterior
-from lsvision.stages.calibration.board_scale import explained_by_size, with_unknown_size
+from lsvision.geometry import sharp_depth_mm
+from lsvision.stages.calibration.batch import BatchCalibration, errors_along_scan_of, iterations_of
 from lsvision.stages.calibration.config import CalibrationConfig
+from lsvision.stages.calibration.correlated import ErrorsAlongScan
 from lsvision.stages.calibration.findings import find_flaws
-from lsvision.stages.calibration.hypotheses import Known
+from lsvision.stages.calibration.hypotheses import Assumed
 from lsvision.stages.calibration.measurements import BoardMeasurements, SoundProblem
-from lsvision.stages.calibration.methods import estimate
 from lsvision.stages.calibration.misplaced import column_rows, largest_residuals
-from lsvision.stages.calibration.model import rotations, squared_residuals, translations
-from lsvision.stages.calibration.noise import board_chi_square, noise_scale, squared_residuals_of_boards
-from lsvision.stages.calibration.observability import observe
+from lsvision.stages.calibration.model import refitted, rotations, squared_residuals, translations
+from lsvision.stages.calibration.noise import board_chi_square
+from lsvision.stages.calibration.observability import Known, observe
 from lsvision.stages.calibration.outliers import outlying
 from lsvision.stages.calibration.problem import BoardProblem, MountingPitch
-from lsvision.stages.calibration.scatter import scatter, widened
+from lsvision.stages.calibration.scatter import widened
+from lsvision.stages.calibration.solution import estimate_with_noise
 from lsvision.stages.calibration.verdict import judge, not_settled, rmse_grew
-from lsvision.types import BoardCorners, BoardFit, Calibration, Iteration, Motion, Pose, Rig
+from lsvision.types import BoardCorners, BoardFit, Calibration, Motion, Pose, Rig
 
 __all__ = ["BatchCalibration", "CalibrationConfig", "calibrate", "calibrate_batch"]
-
-
-@dataclass(frozen=True)
-class BatchCalibration:
-    """Calibrations of a batch of problems; a problem whose ``info`` is SINGULAR holds NaN.
-
-    ``noise_scale`` is the factor on the given covariance that the residuals asked for, 1 where they are as expected;
-    covariances include it. ``rmse_path_mm`` and ``n_path`` run by iteration from the state before (index 0), and repeat
-    the result past a problem's last iteration.
-    """
-
-    n: Float[Tensor, "*batch 3"]
-    covariance: Float[Tensor, "*batch 3 3"]
-    rotation: Float[Tensor, "*batch boards 3 3"]
-    translation_mm: Float[Tensor, "*batch boards 3"]
-    rmse_path_mm: Float[Tensor, "iterations *batch"]
-    n_path: Float[Tensor, "iterations *batch 3"]
-    board_rmse_before_mm: Float[Tensor, "*batch boards"]
-    board_rmse_after_mm: Float[Tensor, "*batch boards"]
-    noise_scale: Float[Tensor, "*batch"]
-    iterations: Int[Tensor, "*batch"]
-    converged: Bool[Tensor, "*batch"]
-    info: Int[Tensor, "*batch"]
 
 
 def calibrate(boards: Sequence[BoardCorners], rig: Rig, config: CalibrationConfig) -> Calibration:
@@ -77,11 +56,14 @@ def calibrate(boards: Sequence[BoardCorners], rig: Rig, config: CalibrationConfi
         raise CalibrationError(
             f"{', '.join(board.scan for board in boards)}: the corners do not determine the boards' poses"
         )
-    observability = observe(solution.problem, solution.posterior.mean, config.prior_sigma, scale)
-    iterations, converged = _iterations(batch), bool(batch.converged)
-    known = Known(config.prior_sigma, config.board_scale_sigma)
-    findings = find_flaws(boards, solution.problem, solution.start, solution.outlying, known)
+    depth_mm = config.depth_range_mm or sharp_depth_mm(rig)
+    known = Known(batch.covariance, config.prior_sigma, scale, depth_mm)
+    observability = observe(solution.weighed, solution.posterior.mean, known)
+    iterations, converged = iterations_of(batch), bool(batch.converged)
+    assumed = Assumed(config.prior_sigma, config.board_scale_sigma)
+    findings = find_flaws(boards, solution.problem, solution.start, solution.outlying, assumed)
     contradictions = [*findings.contradictions, *rmse_grew(iterations[0].rmse_mm, iterations[-1].rmse_mm)]
+    along_scan = errors_along_scan_of(batch)
     judged = judge(not_settled(converged, int(batch.iterations)), contradictions, observability)
     return Calibration(
         method=config.method,
@@ -94,9 +76,10 @@ def calibrate(boards: Sequence[BoardCorners], rig: Rig, config: CalibrationConfi
         rig=rig,
         verdict=judged.verdict,
         reasons=judged.reasons,
-        notes=findings.notes,
+        notes=findings.notes if along_scan else (*findings.notes, *findings.shake),
         converged=converged,
         noise_scale=scale,
+        errors_along_scan=along_scan,
     )
 
 
@@ -126,7 +109,8 @@ def calibrate_batch(
 class _Solution:
     """Problems of a batch, without outlying corners, and their posteriors.
 
-    The posteriors have the noise scaled, the problems as it was given.
+    The posteriors have the noise scaled and allow for the errors ``along_scan``; the problems have it as given.
+    ``scatter`` is that between the boards.
     """
 
     problem: BoardProblem
@@ -135,7 +119,13 @@ class _Solution:
     posterior: Posterior
     noise_scale: Float[Tensor, "*batch"]
     scatter: Float[Tensor, "*batch"]
+    along_scan: ErrorsAlongScan
     prior_sigma: float
+
+    @property
+    def weighed(self) -> BoardProblem:
+        """The problems with the noise that the posteriors allow for, but for its scale."""
+        return replace(self.problem, correlated=self.along_scan.noise)
 
     def summary(self) -> BatchCalibration:
         """The solution as motion and poses of the boards, and its path."""
@@ -143,7 +133,7 @@ class _Solution:
         singular = posterior.info == int(Info.SINGULAR)
         state = torch.where(singular[..., None], torch.nan, posterior.mean)
         path = torch.where(singular[..., None], torch.nan, posterior.path)
-        squared, corners = squared_residuals(problem, path), problem.valid.sum(-1)
+        squared, corners = self._squared_residuals(path), problem.valid.sum(-1)
         board_rmse = (squared / corners).sqrt()
         motion_factor = torch.where(singular[..., None, None], torch.nan, posterior.factor[..., -3:, :])
         covariance = motion_factor @ motion_factor.mT
@@ -159,35 +149,42 @@ class _Solution:
             board_rmse_before_mm=board_rmse[0],
             board_rmse_after_mm=board_rmse[-1],
             noise_scale=torch.where(singular, torch.nan, self.noise_scale),
+            along_scan_rms_mm=self.along_scan.rms_mm,
+            along_scan_length_mm=self.along_scan.length_mm,
             iterations=posterior.iterations,
             converged=posterior.converged & ~singular,
             info=posterior.info,
         )
 
+    def _squared_residuals(self, path: Tensor) -> Tensor:
+        """Sums by iteration and board, mm²; errors along the scan are no fault of n, and poses take what they can."""
+        squared, found = squared_residuals(self.problem, path), self.along_scan.found
+        if bool(found.any()):
+            shaken = self.problem.chosen(found)
+            squared[:, found] = squared_residuals(shaken, refitted(shaken, path[:, found]))
+        return squared
+
 
 def _solve(measured: BoardMeasurements, config: CalibrationConfig) -> _Solution:
-    """The problems estimated without outlying corners, once more where their residuals ask for a larger noise."""
+    """The problems estimated without outlying corners, and with the noise that the others' residuals ask for."""
     config = config.resolved()
     _check(config, measured.points.shape[-3])
     posed = SoundProblem.of(measured, _mounting_pitch(config))
     off = outlying(posed.problem)
     if bool(off.any()):
         posed = SoundProblem.of(replace(measured, valid=measured.valid & ~off), _mounting_pitch(config))
-    problem, start = posed.problem, posed.start
-    posterior = estimate(problem, start, config)
-    scale = apart = torch.ones_like(start[..., 0])
-    if config.method != "sequential" or not config.process_sigma:  # residuals of an n that drifts are no noise
-        by_size = explained_by_size(problem, posterior, config.board_scale_sigma)
-        squared = squared_residuals_of_boards(problem, posterior)
-        scale = noise_scale(problem, squared, by_size)
-        if bool((scale > 1).any()):
-            noisier = replace(problem, noise_chol=problem.noise_chol * scale.sqrt()[..., None, None, None, None])
-            posterior = _merge(scale > 1, estimate(noisier, start, config), posterior)
-            squared = squared_residuals_of_boards(problem, posterior)
-        apart = scatter(problem, squared, posterior, scale, by_size, config.prior_sigma)
-        posterior = with_unknown_size(problem, posterior, scale, config.board_scale_sigma)
-    info = torch.where(posed.sound, posterior.info, int(Info.SINGULAR))
-    return _Solution(problem, start, off, replace(posterior, info=info), scale, apart, config.prior_sigma)
+    found = estimate_with_noise(posed.problem, posed.start, config)
+    info = torch.where(posed.sound, found.posterior.info, int(Info.SINGULAR))
+    return _Solution(
+        posed.problem,
+        posed.start,
+        off,
+        replace(found.posterior, info=info),
+        found.noise_scale,
+        found.scatter,
+        found.along_scan,
+        config.prior_sigma,
+    )
 
 
 def _check(config: CalibrationConfig, boards: int) -> None:
@@ -202,36 +199,9 @@ def _mounting_pitch(config: CalibrationConfig) -> MountingPitch | None:
     return MountingPitch(math.radians(config.mounting_pitch_deg), math.radians(config.mounting_pitch_sigma_deg))
 
 
-def _merge(chosen: Tensor, one: Posterior, other: Posterior) -> Posterior:
-    """``one`` for the chosen problems of a batch, ``other`` for the rest."""
-    length = max(len(one.path), len(other.path))
-    one_path, other_path = (
-        torch.cat([p.path, p.path[-1:].expand(length - len(p.path), *p.path.shape[1:])]) for p in (one, other)
-    )
-    return Posterior(
-        torch.where(chosen[..., None], one.mean, other.mean),
-        torch.where(chosen[..., None, None], one.factor, other.factor),
-        torch.where(chosen[..., None], one_path, other_path),
-        torch.where(chosen, one.iterations, other.iterations),
-        torch.where(chosen, one.converged, other.converged),
-        torch.where(chosen, one.info, other.info),
-    )
-
-
-def _iterations(batch: BatchCalibration) -> tuple[Iteration, ...]:
-    stretch = torch.linalg.vector_norm(batch.n_path, dim=-1)
-    return tuple(
-        Iteration(rmse_mm, (n1, n2, n3), length)
-        for rmse_mm, (n1, n2, n3), length in zip(
-            batch.rmse_path_mm.tolist(), batch.n_path.tolist(), stretch.tolist(), strict=True
-        )
-    )
-
-
 def _board_fits(boards: Sequence[BoardCorners], batch: BatchCalibration, solution: _Solution) -> tuple[BoardFit, ...]:
-    problem = solution.problem
-    chi_square = board_chi_square(problem, solution.posterior)
-    largest = largest_residuals(problem, solution.posterior.mean)
+    problem, state = solution.problem, solution.posterior.mean
+    chi_square, largest = board_chi_square(problem, state), largest_residuals(problem, state)
     return tuple(
         BoardFit(
             scan=board.scan,

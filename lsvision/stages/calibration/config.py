@@ -24,7 +24,10 @@ class CalibrationConfig(Checked):
     does; ``sequential`` filters corner by corner in line order, so that n may drift along the scans; ``least_squares``
     is the maximum of the posterior by Levenberg-Marquardt, the reference that the filter is compared with. The poses'
     prior lies around the poses that fit best under n = (0, 1, 0); infinite sigmas make it flat, so that no corner
-    counts twice. An option that is None takes the value of the method.
+    counts twice. ``two_step`` ends where the RMSE is at most ``two_step_threshold_mm``, or changes by no more than the
+    share ``two_step_tolerance`` in an iteration. An option that is None takes the value of the method. Errors that are
+    correlated along the scan, as of vibration or of the encoder, are allowed for where they make the corners
+    ``correlated_odds`` times as probable.
     """
 
     method: CalibrationMethod = "joint"
@@ -34,9 +37,12 @@ class CalibrationConfig(Checked):
     board_scale_sigma: NonNegative = 0.0  # of the board's relative size, print and temperature; 0 takes it as exact
     max_iterations: PositiveInt = 20
     tolerance: NonNegative = 1e-6  # Kullback-Leibler divergence between two iterates, nats
-    two_step_threshold_mm: NonNegative = 0.05  # RMSE below which Alg. 1 ends
+    two_step_threshold_mm: NonNegative = 0.0  # RMSE at or below which Alg. 1 ends
+    two_step_tolerance: NonNegative = 1e-4  # relative change of the RMSE in an iteration at which Alg. 1 ends
     two_step_max_iterations: PositiveInt = 20
     process_sigma: NonNegative | None = None  # of the random walk of n per square root of a mm; sequential only
+    correlated_odds: PositiveOrInfinite = 50.0  # evidence from which errors along the scan are modelled; .inf: never
+    depth_range_mm: Positive | None = None  # sharp depth, which proposed boards keep to; None: the rig's usual
     mounting_pitch_deg: AcuteAngle | None = None  # known angle of a single board's normal about the sensor axis
     mounting_pitch_sigma_deg: Positive = 0.1
 

@@ -10,7 +10,7 @@ from torch import Tensor
 from lsvision.stages.calibration.causes import NONE, Candidate, Wander, candidates, wanders
 from lsvision.stages.calibration.departure_fit import Beliefs, fit
 from lsvision.stages.calibration.departures import KINDS, ReducedCorners, placement
-from lsvision.stages.calibration.hypotheses import Explanation, Known, explain
+from lsvision.stages.calibration.hypotheses import Assumed, Explanation, explain
 from lsvision.stages.calibration.misplaced import doubts, left_out
 from lsvision.stages.calibration.problem import BoardProblem
 from lsvision.types import BoardCorners
@@ -23,14 +23,15 @@ _CONTRADICTION = 1e-6
 
 @dataclass(frozen=True)
 class Findings:
-    """``contradictions`` make a calibration inconsistent; ``notes`` do not."""
+    """``contradictions`` make a calibration inconsistent; ``notes`` do not, nor does ``shake``, of errors of lines."""
 
     contradictions: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
+    shake: tuple[str, ...] = ()
 
 
 def find_flaws(
-    boards: Sequence[BoardCorners], problem: BoardProblem, start: Tensor, outlying: Tensor, known: Known
+    boards: Sequence[BoardCorners], problem: BoardProblem, start: Tensor, outlying: Tensor, assumed: Assumed
 ) -> Findings:
     """What the corners of one problem say of themselves.
 
@@ -38,12 +39,12 @@ def find_flaws(
         problem: of batch shape (), without outlying corners. start: its state.
         outlying: ``(boards, corners)``, the corners left out.
     """
-    between = contradictions_between(problem, start, [board.scan for board in boards], known)
+    between = contradictions_between(problem, start, [board.scan for board in boards], assumed)
     off = [left_out(board, outlying[i, : len(board.valid)]) for i, board in enumerate(boards)]
-    return Findings((*doubts(off, True), *between.contradictions), (*doubts(off, False), *between.notes))
+    return Findings((*doubts(off, True), *between.contradictions), doubts(off, False), between.shake)
 
 
-def contradictions_between(problem: BoardProblem, start: Tensor, scans: Sequence[str], known: Known) -> Findings:
+def contradictions_between(problem: BoardProblem, start: Tensor, scans: Sequence[str], assumed: Assumed) -> Findings:
     """Whether the boards of one problem fit one motion and the stated board, and what explains it where they do not.
 
     Of planar boards alone; others are taken to fit.
@@ -52,18 +53,18 @@ def contradictions_between(problem: BoardProblem, start: Tensor, scans: Sequence
         return Findings()
     reduced = _batch_of_one(ReducedCorners.of(problem)).scaled()
     at = placement(problem, start).expanded((1,))
-    plain = fit(reduced, at, known.hypothesis(at), Beliefs(known.motion_sigma))
+    plain = fit(reduced, at, assumed.hypothesis(at), Beliefs(assumed.motion_sigma))
     freedom = float(problem.boards * (reduced.smooth_freedom - 6) - 3)
     if _probability(float(plain.chi_square), freedom) > _LOOKED_INTO:
         return Findings()
-    explanation = explain(reduced, at, known)
+    explanation = explain(reduced, at, assumed)
     words = _Words(scans, candidates(problem.boards, reduced.curved, at.n), explanation, _square_mm(problem))
     causes = words.causes()
     left = float(explanation.chi_square)
-    notes = words.wander(wanders(reduced.curved))
-    if not notes and _probability(left, freedom) < _CONTRADICTION:
+    shake = words.wander(wanders(reduced.curved))
+    if not shake and _probability(left, freedom) < _CONTRADICTION:
         causes = (*causes, _unexplained(left, freedom, bool(causes)))
-    return Findings(causes, notes)
+    return Findings(causes, shake=shake)
 
 
 @dataclass(frozen=True)

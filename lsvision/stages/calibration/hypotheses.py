@@ -46,7 +46,7 @@ class Explanation:
 
 
 @dataclass(frozen=True)
-class Known:
+class Assumed:
     """What is known before any cause: sigmas of n about (0, 1, 0) and of the board's relative size."""
 
     motion_sigma: float
@@ -60,14 +60,14 @@ class Known:
         return Hypothesis(pattern, at.n.new_full((count,), self.board_scale_sigma))
 
 
-def explain(reduced: ReducedCorners, start: Placement, known: Known) -> Explanation:
+def explain(reduced: ReducedCorners, start: Placement, assumed: Assumed) -> Explanation:
     """The causes that make the corners of each problem of a batch probable.
 
     Args:
         reduced: corners in sigmas of their own noise, see ``ReducedCorners.scaled``; batch of one dimension.
         start: placements near the boards.
     """
-    return _Search.begin(reduced, start, known).run()
+    return _Search.begin(reduced, start, assumed).run()
 
 
 @dataclass
@@ -76,7 +76,7 @@ class _Search:
 
     reduced: ReducedCorners
     start: Placement
-    known: Known
+    assumed: Assumed
     candidates: list[Candidate]
     wanders: list[Wander]
     information: Tensor
@@ -85,7 +85,7 @@ class _Search:
     wander: Tensor
 
     @classmethod
-    def begin(cls, reduced: ReducedCorners, start: Placement, known: Known) -> "_Search":
+    def begin(cls, reduced: ReducedCorners, start: Placement, assumed: Assumed) -> "_Search":
         """Nothing accepted yet."""
         count, boards = start.n.shape[0], start.position.shape[-2]
         choices = wanders(reduced.curved)
@@ -94,7 +94,7 @@ class _Search:
         causes = candidates(boards, reduced.curved, start.n)
         none = torch.full((_ROUNDS, count), NONE, device=start.n.device)
         rivals = torch.zeros(len(causes), count, dtype=torch.bool, device=start.n.device)
-        return cls(reduced, start, known, causes, choices, information, none, rivals, none[0].clone())
+        return cls(reduced, start, assumed, causes, choices, information, none, rivals, none[0].clone())
 
     def run(self) -> Explanation:
         """Rounds until no move is worth it."""
@@ -149,7 +149,7 @@ class _Search:
             table[k, ..., : candidate.pattern.shape[-1]] = candidate.pattern
             sigma[k, : candidate.pattern.shape[-1]] = candidate.sigma
         used = [number for number in range(_ROUNDS) if bool((self.causes[number] != NONE).any())]
-        given = self.known.hypothesis(self.start)
+        given = self.assumed.hypothesis(self.start)
         if not used:
             return given
         # Parameters in units of their sigma, as it differs between the problems.
@@ -161,8 +161,8 @@ class _Search:
     def beliefs(self) -> Beliefs:
         """Priors with the wander accepted so far."""
         if bool((self.wander == NONE).all()):
-            return Beliefs(self.known.motion_sigma)
-        return Beliefs(self.known.motion_sigma, self.information[self.wander][:, None])
+            return Beliefs(self.assumed.motion_sigma)
+        return Beliefs(self.assumed.motion_sigma, self.information[self.wander][:, None])
 
     def fitted(self, hypothesis: Hypothesis) -> DepartureFit:
         """The fit under a hypothesis."""
@@ -187,7 +187,7 @@ class _Search:
         rows = NormalRows.of(self.reduced, here.at, self.hypothesis(), here.parameters)
         at_once = max(1, _BOARDS_AT_ONCE // self.start.position[..., 0].numel())
         by_wander = [
-            rows.solved(Beliefs(self.known.motion_sigma, some[:, None, None])).log_evidence()
+            rows.solved(Beliefs(self.assumed.motion_sigma, some[:, None, None])).log_evidence()
             for some in self.information[:-1].split(at_once)
         ]
         best, index = torch.cat(by_wander).max(0)

@@ -38,7 +38,7 @@ def linearise(
 
     The linearisation's errors of different boards are taken as independent.
     """
-    columns, reduced = _affine_columns(problem, mean, factor), problem.affine_rows
+    columns, reduced = affine_columns(problem, mean, factor), problem.affine_rows
     rows = product(reduced[..., :-1], columns)
     rows[..., -1] = reduced[..., -1] - rows[..., -1]
     unit = torch.eye(_LATENTS, _LATENTS + 10, dtype=mean.dtype, device=mean.device)
@@ -73,7 +73,7 @@ def motion_information(problem: BoardProblem, state: Float[Tensor, "*batch state
     return root.mT @ root
 
 
-def _affine_columns(problem: BoardProblem, mean: Tensor, factor: Tensor) -> Tensor:
+def affine_columns(problem: BoardProblem, mean: Tensor, factor: Tensor) -> Tensor:
     """The coefficients of the boards' affine maps, ``(*batch, boards, 12, 13)``; columns as of ``_measured_columns``.
 
     The map from board points to measured ones is linear in t, R e_x, R e_y and R e_z.

@@ -1,12 +1,12 @@
 """Corners left out, in words: which they are, how far off they lie, and whether rows or columns were exchanged."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from lsvision.stages.calibration.model import whitened_residuals
+from lsvision.stages.calibration.model import residuals_in_sigmas
 from lsvision.stages.calibration.problem import BoardProblem
 from lsvision.types import BoardCorners
 
@@ -100,8 +100,7 @@ def column_rows(board_points: Tensor, chosen: Tensor) -> tuple[tuple[int, int], 
 
 def largest_residuals(problem: BoardProblem, state: Tensor) -> tuple[float, ...]:
     """The largest residual of a corner of each board, in sigmas of its given covariance."""
-    rows = whitened_residuals(replace(problem, pitch=None), state).unflatten(-1, (*problem.valid.shape[-2:], 3))
-    return tuple(torch.linalg.vector_norm(rows, dim=-1).amax(-1).tolist())
+    return tuple(torch.linalg.vector_norm(residuals_in_sigmas(problem, state), dim=-1).amax(-1).tolist())
 
 
 def doubts(found: Sequence[LeftOut | None], doubtful: bool) -> tuple[str, ...]:

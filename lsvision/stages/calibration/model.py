@@ -19,7 +19,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lsvision.estimation import apply, product
-from lsvision.geometry import displace, scan_position, transform
+from lsvision.geometry import displace, fit_rigid, scan_position, transform, vector_from_rotation
 from lsvision.stages.calibration.problem import BoardProblem, BoardState
 
 
@@ -42,14 +42,25 @@ def residuals(problem: BoardProblem, state: Float[Tensor, "*#batch state"]) -> F
 
 
 def whitened_residuals(problem: BoardProblem, state: Float[Tensor, "*#batch state"]) -> Float[Tensor, "*batch rows"]:
-    """Residuals in sigmas: three of each corner, zero where ``valid`` is false, and one of a known mounting pitch."""
-    parts = BoardState.split(state)
-    predicted = scan_position(predicted_points(problem, state), parts.n[..., None, None, :])
-    error = torch.linalg.solve_triangular(problem.noise_chol, (problem.points - predicted)[..., None], upper=False)
-    rows = torch.where(problem.valid[..., None], error[..., 0], 0.0).flatten(-3)
+    """Residuals in sigmas: three of each corner, zero where ``valid`` is false, and one of a known mounting pitch.
+
+    Where the corners of a board err together, thirteen of each board, of the same sum of squares.
+    """
+    theta = BoardState.split(state).theta
+    rows = residuals_in_sigmas(problem, state).flatten(-3) if problem.correlated is None else _by_board(problem, state)
     if problem.pitch is None:
         return rows
-    return torch.cat([rows, (problem.pitch.angle - pitch_angle(problem, parts.theta)) / problem.pitch.sigma], dim=-1)
+    return torch.cat([rows, (problem.pitch.angle - pitch_angle(problem, theta)) / problem.pitch.sigma], dim=-1)
+
+
+def residuals_in_sigmas(
+    problem: BoardProblem, state: Float[Tensor, "*#batch state"]
+) -> Float[Tensor, "*batch boards corners 3"]:
+    """Residuals of each corner, whitened by its own noise alone; zero where ``valid`` is false."""
+    n = BoardState.split(state).n
+    predicted = scan_position(predicted_points(problem, state), n[..., None, None, :])
+    error = torch.linalg.solve_triangular(problem.noise_chol, (problem.points - predicted)[..., None], upper=False)
+    return torch.where(problem.valid[..., None], error[..., 0], 0.0)
 
 
 def squared_residuals(problem: BoardProblem, state: Float[Tensor, "*#batch state"]) -> Float[Tensor, "*batch boards"]:
@@ -60,6 +71,14 @@ def squared_residuals(problem: BoardProblem, state: Float[Tensor, "*#batch state
     motion = torch.stack([eye[0].expand_as(n), n, eye[2].expand_as(n)], dim=-2)[..., None, :, :]
     coefficients = torch.cat([-parts.position[..., None, :], -rotation.mT, motion.expand_as(rotation)], dim=-2)
     return product(problem.residual_rows, coefficients).square().sum((-2, -1))
+
+
+def refitted(problem: BoardProblem, state: Float[Tensor, "*#batch state"]) -> Float[Tensor, "*batch state"]:
+    """The state of the same n and the poses that fit best under it, all corners weighed alike: those of least RMSE."""
+    n = BoardState.split(state).n
+    fitted = fit_rigid(problem.body_points, displace(problem.points, n[..., None, None, :]), problem.valid)
+    theta = vector_from_rotation(fitted.rotation @ problem.rotation.mT)
+    return BoardState(theta, fitted.translation, n).join()
 
 
 def rmse(problem: BoardProblem, state: Float[Tensor, "*#batch state"]) -> Float[Tensor, "*batch"]:
@@ -82,3 +101,12 @@ def pitch_angle(problem: BoardProblem, theta: Float[Tensor, "*#batch boards 3"])
     """Angles of the boards' normals about the sensor axis, rad."""
     normal = problem.rotation_at(theta)[..., 2]
     return torch.atan2(-normal[..., 1], normal[..., 2])
+
+
+def _by_board(problem: BoardProblem, state: Tensor) -> Tensor:
+    """Through the affine map from board points to measured ones, which ``affine_rows`` are about."""
+    parts = BoardState.split(state)
+    placed = torch.cat([parts.position[..., None, :], problem.rotation_at(parts.theta).mT], dim=-2)
+    coefficients = scan_position(placed, parts.n[..., None, None, :]).flatten(-2)
+    rows = problem.affine_rows
+    return (rows[..., -1] - apply(rows[..., :-1], coefficients)).flatten(-2)

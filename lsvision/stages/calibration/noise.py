@@ -1,8 +1,4 @@
-"""Whether the corners' residuals are as large as their covariance says: over all boards, and board by board.
-
-Residuals are weighed with the linearisation's error as well: where only the prior determines n, the mean of the
-posterior does not lie on the curve of poses and n that fit.
-"""
+"""Whether the corners' residuals are as large as their covariance says: over all boards, and board by board."""
 
 from dataclasses import replace
 
@@ -10,9 +6,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from lsvision.estimation import Posterior
-from lsvision.stages.calibration.linearise import linearise
+from lsvision.stages.calibration.config import CalibrationConfig
+from lsvision.stages.calibration.linearise import linearise, point_factor
 from lsvision.stages.calibration.problem import BoardProblem
+from lsvision.stages.calibration.sequential import filtered
 
 # The noise is scaled up where the given covariance would leave residuals as large with less than this probability.
 _NOISE_TEST_LEVEL = 1e-3
@@ -27,23 +24,41 @@ def noise_scale(
         squared: residuals of each board, see ``squared_residuals_of_boards``.
         explained: part of the squared residuals that is known not to be noise, in sigmas.
     """
-    total = (squared.sum(-1) - explained).clamp(min=0)
     freedom = 3.0 * problem.valid.sum((-2, -1)) - (6 * problem.boards + 3)
-    unlikely = torch.special.gammaincc(freedom / 2, total / 2) < _NOISE_TEST_LEVEL
-    return torch.where(unlikely, total / freedom, 1.0)
+    return _beyond_chance((squared.sum(-1) - explained).clamp(min=0), freedom)
 
 
-def board_chi_square(problem: BoardProblem, posterior: Posterior) -> Float[Tensor, "*batch boards"]:
+def drifting_noise_scale(
+    problem: BoardProblem, start: Float[Tensor, "*batch state"], state: Float[Tensor, "*batch state"],
+    config: CalibrationConfig,
+) -> Float[Tensor, "*batch"]:  # fmt: skip
+    """The same of an n that walks at random: by the innovations of the filter, to which a fixed n's residuals are none.
+
+    The poses are free; n has its prior.
+    """
+    innovations = filtered(problem, start, state, config).whitened_innovations
+    freedom = 3.0 * problem.valid.sum((-2, -1)) - 6.0 * problem.boards
+    return _beyond_chance(innovations.square().sum((0, -1)), freedom)
+
+
+def board_chi_square(problem: BoardProblem, state: Float[Tensor, "*batch state"]) -> Float[Tensor, "*batch boards"]:
     """Squared residuals of each board in sigmas of the corners' given covariance, per degree of freedom.
 
     The unknowns are shared out: the six of its own pose to each board, an equal part of n to all.
     """
     freedom = 3.0 * problem.valid.sum(-1) - 6.0 - 3.0 / problem.boards
-    return squared_residuals_of_boards(problem, posterior) / freedom
+    return squared_residuals_of_boards(problem, state) / freedom
 
 
-def squared_residuals_of_boards(problem: BoardProblem, posterior: Posterior) -> Float[Tensor, "*batch boards"]:
-    """Squared residuals in sigmas of the given covariance, summed over the corners of each board."""
+def _beyond_chance(squared: Tensor, freedom: Tensor) -> Tensor:
+    unlikely = torch.special.gammaincc(freedom / 2, squared / 2) < _NOISE_TEST_LEVEL
+    return torch.where(unlikely, squared / freedom, 1.0)
+
+
+def squared_residuals_of_boards(
+    problem: BoardProblem, state: Float[Tensor, "*batch state"]
+) -> Float[Tensor, "*batch boards"]:
+    """Squared residuals in sigmas of the given noise, summed over the corners of each board."""
     corners_alone = problem if problem.pitch is None else replace(problem, pitch=None)
-    rows = linearise(corners_alone, posterior.mean, posterior.factor).matrix[..., -1]
+    rows = linearise(corners_alone, state, point_factor(state)).matrix[..., -1]
     return rows.unflatten(-1, (problem.boards, -1)).square().sum(-1)

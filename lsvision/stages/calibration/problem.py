@@ -4,7 +4,7 @@ The state is x = [θ_1, t_1, .., θ_B, t_B, n]: for each board a rotation vector
 the position of its corners' centroid, then the motion n. ``model`` relates it to the corners.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import torch
@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from lsvision.geometry import displace, fit_rigid, rotation_from_vector
-from lsvision.stages.calibration.reduction import affine_rows, residual_rows
+from lsvision.stages.calibration.reduction import CorrelatedNoise, affine_rows, residual_rows
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,8 @@ class BoardProblem:
     """Measured corners of several boards, and the nominal rotations that the state is written about.
 
     ``points`` are (x, y = travel, z), mm, zero where ``valid`` is false; ``noise_chol`` the Cholesky factor of their
-    covariance; ``body_points`` the board points from the ``centroid`` of the valid ones, mm.
+    covariance; ``body_points`` the board points from the ``centroid`` of the valid ones, mm. ``correlated`` replaces
+    ``noise_chol`` where the corners of a board err together.
     """
 
     points: Float[Tensor, "*batch boards corners 3"]
@@ -57,19 +58,39 @@ class BoardProblem:
     valid: Bool[Tensor, "*batch boards corners"]
     rotation: Float[Tensor, "*batch boards 3 3"]
     pitch: MountingPitch | None = None
+    correlated: CorrelatedNoise | None = None
 
     @property
     def boards(self) -> int:
         """Number of boards, B; the state has 6 B + 3 components."""
         return self.points.shape[-3]
 
+    def scaled(self, noise_scale: Float[Tensor, "*batch"]) -> "BoardProblem":
+        """The problem with the covariance of the corners' noise multiplied by a factor."""
+        sigma, correlated = noise_scale.sqrt()[..., None, None, None], self.correlated
+        if correlated is not None:
+            freedom = 3.0 * self.valid.sum((-2, -1))
+            correlated = CorrelatedNoise(correlated.rows / sigma, correlated.log_det + freedom * noise_scale.log())
+        return replace(self, noise_chol=self.noise_chol * sigma[..., None], correlated=correlated)
+
     def rotation_at(self, theta: Float[Tensor, "*#batch boards 3"]) -> Float[Tensor, "*batch boards 3 3"]:
         """Rotations exp(θ) R0 of the boards."""
         return rotation_from_vector(theta) @ self.rotation
 
+    def chosen(self, place: Bool[Tensor, "*batch"] | tuple[int, ...]) -> "BoardProblem":
+        """The problems of a batch where a mask is true, in one leading dimension; the one at a tuple of indices."""
+        names = ("points", "noise_chol", "body_points", "centroid", "valid", "rotation")
+        correlated = None if self.correlated is None else self.correlated.chosen(place)
+        problem = replace(self, correlated=correlated, **{name: getattr(self, name)[place] for name in names})
+        if "affine_rows" in self.__dict__:  # the dear one is not computed again
+            problem.__dict__["affine_rows"] = self.affine_rows[place]
+        return problem
+
     @cached_property
     def affine_rows(self) -> Float[Tensor, "*batch boards 13 13"]:
         """``reduction.affine_rows`` of the corners."""
+        if self.correlated is not None:
+            return self.correlated.rows
         return affine_rows(self.noise_chol, self.points, self.body_points, self.valid)
 
     @cached_property
@@ -80,6 +101,8 @@ class BoardProblem:
     @cached_property
     def noise_log_det(self) -> Float[Tensor, "*batch"]:
         """Log-determinant of the covariance of all valid corners' points."""
+        if self.correlated is not None:
+            return self.correlated.log_det
         by_corner = self.noise_chol.diagonal(dim1=-2, dim2=-1).prod(-1).log()
         return 2 * torch.where(self.valid, by_corner, 0.0).sum((-2, -1))
 

@@ -4,6 +4,8 @@ Both reductions are the triangular root of rows over all corners, so that sums o
 rows stay the same. They buy speed: an iteration costs the same for 88 corners as for 10.
 """
 
+from dataclasses import dataclass
+
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -13,6 +15,18 @@ from lsvision.estimation.linalg import forward_substitute
 
 # Boards whose whitened corners are reduced at once: some 2 MB, as much as stays near a processor.
 _BOARDS_IN_CACHE = 64
+
+
+@dataclass(frozen=True)
+class CorrelatedNoise:
+    """``affine_rows`` whitened by a noise that is correlated between a board's corners, and its log-determinant."""
+
+    rows: Float[Tensor, "*batch boards 13 13"]
+    log_det: Float[Tensor, "*batch"]
+
+    def chosen(self, place: Bool[Tensor, "*batch"] | tuple[int, ...]) -> "CorrelatedNoise":
+        """That of the problems where a mask is true, in a row; of the one at a tuple of indices."""
+        return CorrelatedNoise(self.rows[place], self.log_det[place])
 
 
 def affine_rows(
@@ -48,6 +62,31 @@ def feature_rows(
         return _feature_rows(*parts)
     step = max(1, _BOARDS_IN_CACHE // points.shape[-3])
     return torch.cat([_feature_rows(*pieces) for pieces in zip(*(part.split(step) for part in parts), strict=True)])
+
+
+def rows_with_latents(
+    noise_chol: Float[Tensor, "boards corners 3 3"],
+    points: Float[Tensor, "boards corners 3"],
+    body_points: Float[Tensor, "boards corners 3"],
+    valid: Bool[Tensor, "boards corners"],
+    latents: Float[Tensor, "boards corners 3 latents"],
+) -> CorrelatedNoise:
+    """``affine_rows`` of corners that err by ``latents`` @ ξ too, ξ ~ N(0, I) of each board.
+
+    ξ are unknowns with a unit prior, eliminated by the same QR: no covariance between corners is ever formed. The
+    log-determinant is that of the whole noise less that of ``noise_chol``.
+    """
+    count = latents.shape[-1]
+    eye = torch.eye(3, dtype=points.dtype, device=points.device)
+    factors = torch.nn.functional.pad(body_points, (1, 0), value=1.0)
+    by_map = (factors[..., None, :, None] * eye[:, None, :]).flatten(-2)
+    columns = torch.cat([latents, by_map, points[..., None]], dim=-1)
+    whitened = torch.linalg.solve_triangular(noise_chol, columns, upper=False)
+    whitened = torch.where(valid[..., None, None], whitened, 0.0).flatten(-3, -2)
+    unit = torch.eye(count, columns.shape[-1], dtype=points.dtype, device=points.device)
+    root = upper_root(torch.cat([unit.expand(*valid.shape[:-1], -1, -1), whitened], dim=-2))
+    by_latents = root[..., :count, :count].diagonal(dim1=-2, dim2=-1).abs().log().sum((-2, -1))
+    return CorrelatedNoise(root[..., count:, count:], 2.0 * by_latents)
 
 
 def residual_rows(

@@ -19,23 +19,21 @@ _LEVEL = 1e-4
 
 def scatter(
     problem: BoardProblem,
-    squared: Float[Tensor, "*batch boards"],
+    squared: Float[Tensor, "*batch"],
     posterior: Posterior,
     noise_scale: Float[Tensor, "*batch"],
-    explained: Float[Tensor, "*batch"],
     prior_sigma: float,
 ) -> Float[Tensor, "*batch"]:
     """Chi-square between the boards per degree of freedom, in sigmas of the scaled noise; 1 where chance explains it.
 
     Args:
-        squared: residuals of each board in sigmas of the given covariance.
-        noise_scale: of the corners, with which the posterior was computed.
-        explained: part of the squared residuals that is no contradiction, in sigmas of the given covariance.
+        squared: residuals at the posterior's mean in sigmas of the scaled noise.
+        noise_scale: of the corners.
         prior_sigma: of each component of n.
     """
     planar = 9 if not bool(problem.body_points[..., 2].any()) else 12
     within = problem.affine_rows[..., planar:, -1].square().sum((-2, -1))
-    between = (squared.sum(-1) - within - explained).clamp(min=0) / noise_scale
+    between = (squared - within / noise_scale).clamp(min=0)
     known_by_prior = posterior.factor[..., -3:, :].square().sum((-2, -1)) / prior_sigma**2
     freedom = (planar - 6.0) * problem.boards - 3.0 + known_by_prior.clamp(max=3.0)
     unlikely = torch.special.gammaincc(freedom / 2, between / 2) < _LEVEL

@@ -14,10 +14,11 @@ from lsvision.geometry import (
     triangulate,
     triangulation_jacobian,
 )
-from lsvision.image.board.detect import detect_board
+from lsvision.image.board.detect import SeenBoard, locate_corners, look_for_board
 from lsvision.image.board.refine import DetectedCorners
 from lsvision.image.planes import fit_local_planes
 from lsvision.stages.corners.config import CornersConfig
+from lsvision.stages.corners.pairing import pair_lattices
 from lsvision.types import Board, BoardCorners, DepthView, LineImage, Scan, StereoPair, Travel
 
 
@@ -41,11 +42,12 @@ def find_corners(scan: Scan, board: Board, config: CornersConfig | None = None) 
         BoardNotFoundError: no board, or fewer than ``min_corners`` corners, in one of the images; names the scan.
     """
     config = config or CornersConfig()
-    left = _detect(scan, scan.left, "left", board)
     match scan.images:
         case StereoPair(_, right_image):
-            measured = _triangulated(scan, left, _detect(scan, right_image, "right", board), config)
+            left, right = _detect_in_both(scan, right_image, board)
+            measured = _triangulated(scan, left, right, config)
         case DepthView(_, depth):
+            [left] = _located(scan, [scan.left], [_look(scan, scan.left, "left", board)], board)
             measured = _from_depth_map(scan, left, depth, config)
     valid = measured.valid
     if int(valid.sum()) < config.min_corners:
@@ -64,11 +66,27 @@ def find_corners(scan: Scan, board: Board, config: CornersConfig | None = None) 
     )
 
 
-def _detect(scan: Scan, image: LineImage, side: str, board: Board) -> DetectedCorners:
-    detected = detect_board(image, board, mirrored=scan.travel.transport == "reverse")
-    if detected is None:
+def _detect_in_both(scan: Scan, right_image: LineImage, board: Board) -> list[DetectedCorners]:
+    """Corners of both images in the same order."""
+    left, right = _look(scan, scan.left, "left", board), _look(scan, right_image, "right", board)
+    paired = right.with_nodes(pair_lattices(scan, board, left, right))
+    return _located(scan, [scan.left, right_image], [left, paired], board)
+
+
+def _look(scan: Scan, image: LineImage, side: str, board: Board) -> SeenBoard:
+    seen = look_for_board(image, board)
+    if seen is None:
         raise BoardNotFoundError(f"{scan.path}: no board of {board.columns} x {board.rows} squares in the {side} image")
-    return detected
+    return seen
+
+
+def _located(scan: Scan, images: list[LineImage], seen: list[SeenBoard], board: Board) -> list[DetectedCorners]:
+    located = locate_corners(images, seen, board, mirrored=scan.travel.transport == "reverse")
+    if located is None:
+        raise BoardNotFoundError(
+            f"{scan.path}: too few corners of a board of {board.columns} x {board.rows} squares are seen"
+        )
+    return located
 
 
 def _triangulated(scan: Scan, left: DetectedCorners, right: DetectedCorners, config: CornersConfig) -> _Measured:

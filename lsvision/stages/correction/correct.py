@@ -16,7 +16,7 @@ from lsvision.image.resampling import SAMPLED_TILES
 from lsvision.image.tiling import TILE, in_parallel, tiles
 from lsvision.stages.correction.color_lines import ColorLines, color_lines, sampling_for
 from lsvision.stages.correction.config import CorrectionConfig
-from lsvision.stages.correction.grid import plan_product
+from lsvision.stages.correction.grid import plan_product, source_dtype
 from lsvision.stages.correction.locate import Locator, SeenCells
 from lsvision.stages.correction.profiles import ProfileReader, ProfileRule
 from lsvision.stages.correction.uncertainty import position_sigma
@@ -103,7 +103,8 @@ class Correction:
         height = seen.relief + self.frame.height_over_relief_mm
         strip.valid[tile] = seen.measured
         strip.height[tile] = height.masked_fill_(~seen.measured, torch.nan)
-        strip.source[tile][..., 0], strip.source[tile][..., 1] = seen.line + seen.first_line, seen.column
+        line = seen.line.to(strip.source.dtype) + seen.first_line
+        strip.source[tile][..., 0], strip.source[tile][..., 1] = line, seen.column
         if strip.sigma is not None:
             strip.sigma[tile] = self._position_sigma(seen).masked_fill_(~seen.measured[..., None], torch.nan)
 
@@ -123,6 +124,6 @@ class Correction:
             height=torch.full(shape, torch.nan),
             valid=torch.zeros(shape, dtype=torch.bool),
             # Plane by plane in memory, as they are filled and as products are stored.
-            source=torch.full((2, *shape), torch.nan).movedim(0, -1),
+            source=torch.full((2, *shape), torch.nan, dtype=source_dtype(self.scan.lines)).movedim(0, -1),
             sigma=torch.full((3, *shape), torch.nan).movedim(0, -1) if self.config.uncertainty else None,
         )

@@ -10,9 +10,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from lsvision.geometry import ProductFrame, object_pitch_mm, zero_disparity_mm
+from lsvision.geometry import ProductFrame, object_pitch_mm
 from lsvision.image.visibility import Seen, Surface, see_cells
 from lsvision.stages.correction.config import CorrectionConfig
+from lsvision.stages.correction.grid import offset_range
 from lsvision.stages.correction.profiles import ProfileReader
 from lsvision.types import ProductGrid
 
@@ -83,7 +84,7 @@ class Locator:
 
     def lines_of(self, rows: tuple[int, int], scan_lines: int) -> LineRange:
         """The scan lines that rows ``rows[0]..rows[1]-1`` of the product can come from, with some to spare."""
-        low, high = self._offset_range(slice(0, self.grid.columns))
+        low, high = offset_range(self.frame, self.grid, slice(0, self.grid.columns), self.config)
         q_y = torch.tensor([self.grid.q_y(rows[0]), self.grid.q_y(rows[1] - 1)], dtype=torch.float64)
         line = self.frame.line(torch.cat([q_y - low, q_y - high]))
         start = max(math.floor(float(line.min())) - 2, 0)
@@ -96,7 +97,7 @@ class Locator:
         Args:
             lines: those of ``lines_of``, loaded in ``profiles``.
         """
-        low, high = self._offset_range(columns)
+        low, high = offset_range(self.frame, self.grid, columns, self.config)
         near = lines.reaching(self.grid.q_y(rows[0]) - high, self.grid.q_y(rows[1] - 1) - low)
         if len(near.along) < 2:
             return None
@@ -132,11 +133,6 @@ class Locator:
             .logical_and_(missed <= config.bridge_px),
             measured=(profiles.measured[1:] & profiles.measured[:-1]).logical_and_(missed <= _MISSED_LINES),
         )
-
-    def _offset_range(self, columns: slice) -> tuple[float, float]:
-        """Least and greatest part of q_y, mm, that comes from the place across the line, over some columns."""
-        z = zero_disparity_mm(self.frame.rig) - torch.tensor(self.config.height_range_mm, dtype=torch.float64)
-        return self.frame.offset_range(self.grid.q_x(columns)[[0, -1]], z)
 
 
 def _snapped(cells: Tensor) -> Tensor:

@@ -90,7 +90,8 @@ def _measure(left: Tensor, right: Tensor, rig: Rig, config: DisparityConfig) -> 
         window=config.refine_window,
         iterations=config.refine_iterations,
         noise=config.refine_noise,
-        largest_sigma_px=config.largest_sigma_px,
+        largest_sigma_px=config.largest_sigma_px or math.inf,
+        with_gain=config.matcher == "sgbm",
     )
     refined = refine_disparity(left, right, disparity, options)
     return StripMatch(refined.disparity, refined.sigma)

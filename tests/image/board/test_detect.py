@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from lsvision.geometry import line_at, project, scan_position, transform
-from lsvision.image.board.detect import detect_board, find_grid, reduce_image
+from lsvision.image.board.detect import detect_board, reduce_image
 from lsvision.image.board.order import order_grid
 from lsvision.image.board.refine import refine_grid
 from lsvision.image.brightness import gray
@@ -114,7 +114,7 @@ def test_no_board_is_none():
     for image in (noise, flat, stripes, flat[:5]):
         assert detect_board(TensorImage(image), ASYMMETRIC) is None
     image, _ = drawn_board(ASYMMETRIC)
-    assert find_grid(gray(image), (8, 7)) is None
+    assert detect_board(TensorImage(image), Board(9, 8, 20.0)) is None
 
 
 def test_windows_beyond_the_image_are_invalid():

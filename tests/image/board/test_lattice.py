@@ -1,4 +1,4 @@
-"""Boards from saddles: the strongest saddles, the lattice through them, and the board on the lattice."""
+"""Lattices from saddles: the strongest saddles and the lattice through them."""
 
 import math
 
@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from lsvision.image.board.lattice import QuadraticMap, board_on_lattice, grow_lattice
+from lsvision.image.board.lattice import QuadraticMap, SeenLattice, grow_lattice
 from lsvision.image.board.saddle_points import SaddlePoints, find_saddle_points
 
 INNER = (5, 4)
@@ -82,18 +82,26 @@ def test_saddles_on_one_line_are_no_lattice(nodes):
     assert grow_lattice(saddles_at(nodes[:1]), 0) is None
 
 
-@pytest.mark.parametrize("turned", [False, True])
-def test_missing_corners_lie_where_the_grid_continues(nodes, turned):
-    kept = torch.ones(20, dtype=torch.bool)
-    kept[[0, 7, 13, 19]] = False
-    node = nodes.flip(-1) if turned else nodes
-    grid = board_on_lattice(bent(nodes)[kept], node[kept].double() - 3, INNER)
-    assert grid.shape == (INNER[1], INNER[0], 2)
-    assert torch.equal(grid.reshape(-1, 2)[kept], bent(nodes)[kept])
-    torch.testing.assert_close(grid.reshape(-1, 2), bent(nodes), rtol=0, atol=1e-9)
+def test_a_lattice_counted_along_other_axes(nodes):
+    lattice = SeenLattice(nodes, bent(nodes))
+    axes = torch.tensor([[0, -1], [1, 0]])
+    turned = lattice.turned(axes, torch.tensor([3, 1]))
+    assert turned.node[INNER[0] + 2].tolist() == [2, 3]  # from column 2, row 1
+    same = lattice.to_image()(nodes.double())
+    torch.testing.assert_close(turned.to_image()(turned.node.double()), same, rtol=0, atol=1e-8)
+    torch.testing.assert_close(turned.steps(), lattice.steps() @ axes.double().mT)
+    enlarged = SeenLattice(nodes, torch.tensor([[0.0, 1.0]]).double().expand(len(nodes), 2)).enlarged(4)
+    assert enlarged.position[0].tolist() == [1.5, 5.5]
 
 
-def test_too_few_corners_or_too_many_strays_are_no_board(nodes):
-    assert board_on_lattice(bent(nodes)[:9], nodes[:9].double(), INNER) is None
-    strays = torch.cat([nodes, nodes[:3] + 40])
-    assert board_on_lattice(bent(strays), strays.double(), INNER) is None
+def test_evenness_depends_neither_on_contrast_nor_on_the_fall_off_of_light():
+    v, u = torch.meshgrid(torch.arange(120.0), torch.arange(160.0), indexing="ij")
+    wave = torch.sin(math.pi * u / 20).sign() * torch.sin(math.pi * v / 20).sign()
+    light = 1 - 0.6 * u / 160
+    even = {}
+    for contrast in (80.0, 8.0):
+        found = find_saddle_points(100 + contrast * wave * light, most=60, expected=30)
+        inside = ((found.points > 12) & (found.points < torch.tensor([148, 108]))).all(-1)
+        even[contrast] = found.evenness[inside]
+        assert even[contrast].max() < 1.1 * even[contrast].min()
+    torch.testing.assert_close(even[80.0].mean(), even[8.0].mean(), rtol=1e-3, atol=0)

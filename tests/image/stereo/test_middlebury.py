@@ -7,7 +7,7 @@ import torch
 
 from lsvision.geometry import focal_length_px, zero_disparity_mm
 from lsvision.stages.disparity.config import DisparityConfig
-from lsvision.stages.disparity.match import measure_strip
+from lsvision.stages.disparity.match import StripMatch, measure_strip
 from lsvision.types import Rig
 
 HIGHEST_PX = 79
@@ -30,6 +30,22 @@ def bad_share(disparity: torch.Tensor, truth: torch.Tensor) -> float:
     return float((~((disparity - truth).abs() <= 1.0))[torch.isfinite(truth)].float().mean())
 
 
+def matched(left: torch.Tensor, right: torch.Tensor, **options: float) -> StripMatch:
+    """Disparities of 0..79 px by the default matcher."""
+    highest = zero_disparity_mm(RIG) - focal_length_px(RIG) * RIG.baseline_mm / (HIGHEST_PX + 31.086)
+    return measure_strip(left, right, RIG, DisparityConfig(height_range_mm=(0.0, highest), **options))
+
+
+def test_sigma_is_that_of_the_errors_on_a_photograph(motorcycle):
+    """By the median, and by the rms of those right to a pixel; the truth itself is good to a twentieth of one."""
+    left, right, truth = motorcycle
+    match = matched(left, right)
+    error = match.disparity - truth
+    ratio = (error / match.sigma)[error.abs() <= 1.0].abs()
+    assert 0.8 < ratio.median() / 0.6745 < 1.3
+    assert 0.8 < ratio.square().mean().sqrt() < 1.3
+
+
 def test_no_more_pixels_are_bad_than_with_opencv(motorcycle):
     left, right, truth = motorcycle
     grey = [cv2.cvtColor(image.numpy(), cv2.COLOR_RGB2GRAY) for image in (left, right)]
@@ -39,8 +55,6 @@ def test_no_more_pixels_are_bad_than_with_opencv(motorcycle):
     )  # fmt: skip
     expected = torch.from_numpy(peer.compute(*grey)).float() / 16
     expected = torch.where(expected >= 0, expected, torch.nan)
-    z0 = zero_disparity_mm(RIG)
-    highest = z0 - focal_length_px(RIG) * RIG.baseline_mm / (HIGHEST_PX + 31.086)
-    match = measure_strip(left, right, RIG, DisparityConfig(height_range_mm=(0.0, highest), largest_sigma_px=0.2))
+    match = matched(left, right, largest_sigma_px=0.2)
     assert bad_share(expected, truth) == pytest.approx(0.2148, abs=0.01)
     assert bad_share(match.disparity, truth) <= bad_share(expected, truth)

@@ -1,12 +1,17 @@
 """Sub-pixel refinement: equal to loops, unbiased on pairs of known shift, and uncertain where there is no texture."""
 
+import dataclasses
 import math
 
 import pytest
 import torch
 
 from lsvision.image.stereo.refine import RefineOptions, refine_disparity
+from lsvision.image.stereo.scatter import SigmaGains
 from lsvision.image.stereo.sgbm import GrayPair, match_sgbm
+from lsvision.image.stereo.shift import LeftWindows
+from lsvision.image.stereo.warp import warp_cubic
+from lsvision.image.stereo.windows import Windows
 from tests.image.stereo.test_sgbm import search
 
 LINES, WIDTH = 64, 240
@@ -41,7 +46,7 @@ def naive_cubic(row, position):
 
 
 def naive_refinement(left, right, start, options):
-    """Disparity and sigma of one step at every pixel, by sums over the valid pixels of its window."""
+    """Disparity and sigma at every pixel, by sums over the valid pixels of its window."""
     lines, width = start.shape
     pixels = [(i, j) for i in range(lines) for j in range(width)]
     valid, disparity = start.isfinite(), {p: float(start[p].nan_to_num()) for p in pixels}
@@ -73,6 +78,11 @@ def naive_refinement(left, right, start, options):
         variance = max(variance * count / max(count - 2, 1), 1 / 6)
         true_texture = max(texture - variance * 0.5 / 1.6, 0) + prior
         sigma[p] = math.sqrt((texture + prior) * variance / max(count, 1)) / true_texture
+    gains = SigmaGains.of(options.window, options.iterations)
+    deviation = {p: min(max(mean(disparity, p) - disparity[p], -0.8), 0.8) ** 2 for p in pixels}
+    for p in pixels:
+        predicted = gains.iterations * sigma[p]
+        sigma[p] = math.sqrt(gains.scatter**2 * mean(deviation, p) + 0.15 * predicted**2 + 0.01**2)
     return tuple(torch.tensor([each[p] for p in pixels]).view(lines, width) for each in (disparity, sigma))
 
 
@@ -87,9 +97,7 @@ def test_equals_the_naive_loops(iterations):
     valid = start.isfinite()
     assert torch.equal(refined.disparity.isfinite(), valid)
     torch.testing.assert_close(refined.disparity[valid], disparity[valid], rtol=0, atol=1e-4)
-    gain = (refined.sigma / sigma)[valid]  # of sigma over several iterations
-    torch.testing.assert_close(gain, gain[:1].expand_as(gain), rtol=2e-3, atol=0)
-    assert iterations > 1 or gain[0] == pytest.approx(1.0, abs=1e-3)
+    torch.testing.assert_close(refined.sigma[valid], sigma[valid], rtol=2e-3, atol=0)
 
 
 @pytest.mark.parametrize("shift", [-3.4, 0.25, 2.5, 7.8])
@@ -153,6 +161,41 @@ def test_brightness_offset_changes_nothing():
     start = torch.ones(LINES, WIDTH)
     refined = refine(left, right, start)
     torch.testing.assert_close(refine(left + 30, right - 20, start), refined, rtol=0, atol=1e-3)
+
+
+def test_a_factor_of_brightness_changes_little_where_it_is_an_unknown():
+    left, right = texture(torch.tensor(0.0), 0.5), texture(torch.tensor(1.3), 0.5)
+    start = torch.ones(LINES, WIDTH)
+    with_gain = dataclasses.replace(REFINE, with_gain=True)
+    darker = 0.7 * right + 12.0
+    error, without = ((refine(left, darker, start, options) - 1.3)[INSIDE] for options in (with_gain, REFINE))
+    equal = (refine(left, right, start) - 1.3)[INSIDE]
+    assert error.square().mean().sqrt() < 1.5 * equal.square().mean().sqrt() < without.square().mean().sqrt()
+    assert abs(error.mean()) < 0.005
+
+
+def test_sigma_covers_ground_that_no_plane_fits():
+    """A ripple of 18 px is smoothed by a window of 9: an error that no residual of white noise predicts."""
+    v, u = torch.meshgrid(torch.arange(LINES).float(), torch.arange(WIDTH).float(), indexing="ij")
+    truth = 3.0 + 0.5 * torch.sin(2 * math.pi * u / 18) * torch.sin(2 * math.pi * v / 18)
+    left, right = texture(-truth, 0.5), texture(torch.tensor(0.0), 0.5)
+    refined = refine_disparity(left, right, torch.full((LINES, WIDTH), 3.0), REFINE)
+    residual = left - warp_cubic(right, refined.disparity)
+    windows = Windows.over(truth == truth, 9)
+    equations = LeftWindows.of(left, windows, 0.5, with_gain=False)
+    alone = equations.certainty(residual, equations.fit(residual)).sigma
+    error = (refined.disparity - truth)[INSIDE].abs().median() / 0.6745
+    assert 0.7 < error / refined.sigma[INSIDE].median() < 1.3
+    assert error > 2 * alone[INSIDE].median()
+
+
+def test_a_match_that_explains_little_must_be_more_certain():
+    left, right, other = (texture(torch.tensor(shift), 0.5) for shift in (0.0, 1.0, 77.0))
+    right[:, 120:] = other[:, 120:]
+    options = dataclasses.replace(REFINE, largest_sigma_px=0.2)
+    kept = refine(left, right, torch.ones(LINES, WIDTH), options).isfinite()
+    assert kept[8:-8, 8:110].all()
+    assert kept[8:-8, 130:-8].float().mean() < 0.05
 
 
 def test_a_large_change_is_undone():

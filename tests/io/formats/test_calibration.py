@@ -54,6 +54,7 @@ def test_file_has_the_documented_keys(tmp_path: Path, calibration: Calibration) 
             "notes",
             "converged",
             "noise_scale",
+            "errors_along_scan",
             "motion",
             "rmse_before_mm",
             "rmse_after_mm",

@@ -6,13 +6,15 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from lsvision.geometry import rotation_from_vector, scan_position, transform
+from lsvision.geometry import displace, rotation_from_vector, scan_position, transform
 from lsvision.stages.calibration.problem import BoardProblem, nominal_problem
 from lsvision.types import Board, BoardCorners, Rig
 
 RIG = Rig(1786, 40.0, 113.84, 354.0, 260.125, 1524.375)
 SIGMA = (0.020, 0.020, 0.014)  # of x, y and z, mm
 THREE_TILTS = ((10.0, 0.0, 2.0), (-10.0, 5.0, 1.0), (3.0, -10.0, 0.0))
+
+FOUR_TILTS = ((2.0, 1.5, 0.0), (-5.0, 1.0, 6.0), (5.0, -2.0, -8.0), (-1.0, -3.5, 14.0))  # those of the paper experiment
 
 
 def true_motion(yaw_deg: float = 2.0, pitch_deg: float = 1.5, stretch: float = 1.0246) -> Tensor:
@@ -69,6 +71,20 @@ def simulate(
     covariance = torch.diag(sigmas.clamp(min=1e-6) ** 2).expand(*points.shape, 3)
     valid = torch.ones(points.shape[:-1], dtype=torch.bool)
     return Corners(points, covariance, body.expand_as(points), valid, n, rotation, translation)
+
+
+def drawn(tilts, prior_sigma: float, runs: int) -> Corners:
+    """Corners of sets whose true n is drawn from the prior about (0, 1, 0), every ninth of each board."""
+    n = torch.tensor([0.0, 1.0, 0.0]).double() + prior_sigma * torch.randn(runs, 3, dtype=torch.float64)
+    nominal = thinned(simulate(tilts, batch=(runs,), sigma=(0.0, 0.0, 0.0), n=torch.tensor([0.0, 1.0, 0.0]).double()))
+    exact = scan_position(displace(nominal.points, torch.tensor([0.0, 1.0, 0.0])), n[:, None, None, :])
+    sigmas = torch.tensor(SIGMA, dtype=torch.float64)
+    return replace(
+        nominal,
+        points=exact + sigmas * torch.randn_like(exact),
+        covariance=torch.diag(sigmas**2).expand(*exact.shape, 3),
+        n=n,
+    )
 
 
 def thinned(corners: Corners) -> Corners:

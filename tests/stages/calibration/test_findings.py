@@ -1,5 +1,6 @@
 """What a calibration says of boards that do not fit, and sigmas that cover an unknown size of the board."""
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -58,8 +59,11 @@ def test_sound_boards_need_no_words():
     assert (result.verdict, result.reasons, result.notes) == ("determined", (), ())
 
 
-def test_a_shake_is_a_note_and_no_contradiction():
-    result = said(shaken(sound(THREE, 1), 0.03, 97.0))
+def test_a_shake_is_a_note_and_no_contradiction_where_nothing_else_says_so():
+    shake = shaken(sound(THREE, 1), 0.03, 97.0)
+    assert said(shake).errors_along_scan
+    assert (said(shake).verdict, said(shake).notes) == ("determined", ())
+    result = said(shake, CalibrationConfig(correlated_odds=math.inf))
     assert result.reasons == ()
     (note,) = result.notes
     assert note.startswith("the corners of each line are displaced together by about 0.03 mm")

@@ -9,7 +9,7 @@ import torch
 from lsvision.stages.calibration.causes import NONE, candidates, wanders
 from lsvision.stages.calibration.departure_fit import Beliefs, Hypothesis, fit
 from lsvision.stages.calibration.departures import KINDS, Placement, ReducedCorners, placement, residual_and_jacobian
-from lsvision.stages.calibration.hypotheses import Known, explain
+from lsvision.stages.calibration.hypotheses import Assumed, explain
 from tests.stages.calibration.boards import SIGMA, simulate
 from tests.stages.calibration.contradictions import (
     DETECTED,
@@ -24,7 +24,7 @@ from tests.stages.calibration.contradictions import (
     sound,
 )
 
-PRIOR = Known(0.05)
+PRIOR = Assumed(0.05)
 SLOW = 200
 FAST = 4
 
@@ -34,10 +34,10 @@ def posed(corners):
     return ReducedCorners.of(problem).scaled(), placement(problem, start)
 
 
-def named(corners, known=PRIOR):
+def named(corners, assumed=PRIOR):
     """What was named in each set: kinds of causes with the number of their scan, and of a wander."""
     reduced, start = posed(corners)
-    found = explain(reduced, start, known)
+    found = explain(reduced, start, assumed)
     causes, choices = candidates(start.position.shape[-2], reduced.curved, start.n), wanders(reduced.curved)
     names = []
     for i in range(len(found.gain)):
@@ -49,9 +49,9 @@ def named(corners, known=PRIOR):
     return names
 
 
-def share(corners, *expected, known=PRIOR):
+def share(corners, *expected, assumed=PRIOR):
     """Share of the sets in which just the expected causes were named."""
-    found = [words for words, _ in named(corners, known)]
+    found = [words for words, _ in named(corners, assumed)]
     return sum(words == list(expected) for words in found) / len(found), Counter(map(tuple, found))
 
 
@@ -140,13 +140,13 @@ def test_a_size_within_its_stated_sigma_is_no_contradiction():
     torch.manual_seed(8)
     larger = other_size(sound(THREE, FAST), 1.0005)
     assert share(larger, "scale")[0] == 1.0
-    assert share(larger, known=Known(0.05, 1e-3))[0] == 1.0
+    assert share(larger, assumed=Assumed(0.05, 1e-3))[0] == 1.0
 
 
 def test_departures_come_out_with_their_sigmas():
     torch.manual_seed(9)
     reduced, start = posed(faster(THREE, (1.00, 1.03, 1.06), 200))
-    found = explain(reduced, start, Known(0.05))
+    found = explain(reduced, start, Assumed(0.05))
     speed, covariance = found.departure[..., 0], found.covariance[:, 0]
     for scan, truth in ((1, 0.03), (2, 0.06)):
         ratio = (1 + speed[:, scan]) / (1 + speed[:, 0])
@@ -159,13 +159,13 @@ def test_batch_equals_loop():
     torch.manual_seed(10)
     corners = faster(THREE, (1.00, 1.03, 1.06), 4)
     reduced, start = posed(corners)
-    together = explain(reduced, start, Known(0.05))
+    together = explain(reduced, start, Assumed(0.05))
     for i in (1, 3):
         chosen = torch.arange(4) == i
         part = Placement(
             *(getattr(start, name)[chosen] for name in ("rotation", "position", "n", "departure", "wander"))
         )
-        alone = explain(reduced.taken(chosen), part, Known(0.05))
+        alone = explain(reduced.taken(chosen), part, Assumed(0.05))
         assert torch.equal(alone.causes[:, 0], together.causes[:, i])
         torch.testing.assert_close(alone.departure[0], together.departure[i], rtol=0, atol=1e-9)
 

@@ -5,16 +5,19 @@ from dataclasses import replace
 import pytest
 import torch
 
-from lsvision.estimation import weighed_directions
+from lsvision.estimation import principal_directions
+from lsvision.geometry import transform
 from lsvision.stages.calibration.calibrate import calibrate
 from lsvision.stages.calibration.config import CalibrationConfig
 from lsvision.stages.calibration.linearise import motion_information
 from lsvision.stages.calibration.methods import joint
-from lsvision.stages.calibration.observability import TILT_GRID_DEG, next_tilt, simulated_information
+from lsvision.stages.calibration.observability import Known, next_tilt, possible_tilts, simulated_information
 from lsvision.stages.calibration.problem import BoardState
-from tests.stages.calibration.boards import RIG, simulate, true_motion
+from tests.stages.calibration.boards import RIG, simulate, tilt, true_motion
 
-LEVEL = true_motion(pitch_deg=0.0)  # the prior's mean is the truth along the direction that one tilt cannot show
+LEVEL = true_motion(
+    yaw_deg=0.0, pitch_deg=0.0
+)  # the prior's mean is the truth along the direction that one tilt cannot show
 
 
 def report(tilts):
@@ -39,7 +42,7 @@ def test_a_single_tilt_does_not_show_n3(tilts):
     assert abs(weakest.vector[2]) > 0.95
     assert weakest.posterior_sigma == pytest.approx(0.05, rel=0.05)
     assert "n3 (in depth)" in found.advice
-    assert "15 deg about the sensor axis" in found.advice
+    assert "deg about the sensor axis" in found.advice
 
 
 @pytest.mark.parametrize("second", [(10.0, 0.0, 0.0), (0.0, 10.0, 0.0)], ids=["about X", "about Y"])
@@ -54,7 +57,13 @@ def test_directions_are_orthogonal_and_their_sigmas_the_posteriors():
     vectors = torch.tensor([direction.vector for direction in result.observability.directions], dtype=torch.float64)
     torch.testing.assert_close(vectors @ vectors.mT, torch.eye(3).double(), rtol=0, atol=1e-12)
     along = (vectors @ result.motion.covariance @ vectors.mT).diagonal().sqrt()
-    assert [d.posterior_sigma for d in result.observability.directions] == pytest.approx(along.tolist(), rel=1e-3)
+    assert [d.posterior_sigma for d in result.observability.directions] == pytest.approx(along.tolist(), rel=1e-9)
+
+
+def covariance_of(posterior):
+    """The covariance of n."""
+    factor = posterior.factor[-3:]
+    return factor @ factor.mT
 
 
 def posterior_sigma(tilts, direction):
@@ -67,12 +76,49 @@ def posterior_sigma(tilts, direction):
 @pytest.mark.parametrize("first", [(0.0, 0.0, 0.0), (6.0, 0.0, 0.0), (0.0, 8.0, 0.0)])
 def test_the_proposed_tilt_lowers_the_sigma_most_when_it_is_scanned(first):
     problem, start = simulate([first], n=LEVEL).problem()
-    state = joint(problem, start, CalibrationConfig()).mean
-    proposal = next_tilt(problem, state, 0.05)
-    weakest = weighed_directions(motion_information(problem, state), 0.05).weakest
-    sigma = {(x, y): posterior_sigma([first, (x, y, 0.0)], weakest) for x in TILT_GRID_DEG for y in TILT_GRID_DEG}
-    assert sigma[proposal] <= 1.002 * min(sigma.values())
-    assert sigma[proposal] < 0.01 * 0.05
+    found = joint(problem, start, CalibrationConfig())
+    known = Known(covariance_of(found), 0.05, depth_range_mm=52.0)
+    proposal = next_tilt(problem, found.mean, known)
+    weakest = principal_directions(known.covariance, 0.05).weakest
+    tilts = [tuple(tilt) for tilt in possible_tilts(problem, found.mean, 52.0).tolist()]
+    sigma = {(x, y): posterior_sigma([first, (x, y, 0.0)], weakest) for x, y in tilts}
+    best = min(sigma.values())
+    assert sigma[proposal.about_x, proposal.about_y] <= 1.002 * best
+    assert best < 0.02 * 0.05
+
+
+@pytest.mark.parametrize("depth_mm", [5.0, 20.0, 52.0, 500.0])
+def test_proposals_keep_to_the_depth_of_the_camera(depth_mm):
+    corners = simulate([(0.0, 0.0, 20.0)], n=LEVEL)
+    problem, start = corners.problem()
+    tilts = possible_tilts(problem, joint(problem, start, CalibrationConfig()).mean, depth_mm)
+    assert [0.0, 0.0] in tilts.tolist()
+    assert tilts.abs().max() <= 15.0
+    for about_x, about_y in tilts.tolist():
+        z = transform(tilt(about_x, about_y, 20.0), torch.zeros(3).double(), corners.board_points[0])[..., 2]
+        assert z.max() - z.min() <= depth_mm + 0.02
+    advice = calibrate(corners.boards(), RIG, CalibrationConfig(depth_range_mm=depth_mm)).observability.advice
+    assert "tilt the board" in advice
+
+
+@pytest.mark.parametrize("reverse", [False, True])
+def test_the_edge_that_is_raised_is_the_one_that_the_sentence_names(reverse):
+    """The proposed tilt is scanned: its raised edge, nearer to the cameras, is the one named."""
+    origin = (20.0, -380.0, 800.0) if reverse else (20.0, 60.0, 800.0)
+    corners = simulate([(0.0, 0.0, 0.0)], n=LEVEL, origin=origin)
+    advice = calibrate(corners.boards(), RIG, CalibrationConfig()).observability.advice
+    problem, start = corners.problem()
+    found = joint(problem, start, CalibrationConfig())
+    proposal = next_tilt(problem, found.mean, Known(covariance_of(found), 0.05, depth_range_mm=52.0))
+    assert (proposal.about_x != 0, proposal.about_y != 0) == ("sensor axis" in advice, "travel axis" in advice)
+    tilted = simulate([(proposal.about_x, proposal.about_y, 0.0)], n=LEVEL, origin=origin, sigma=(0.0, 0.0, 0.0))
+    x, y, z = tilted.points[0].unbind(-1)
+    assert proposal.about_x != 0
+    first, last = z[y.abs().argmin()], z[y.abs().argmax()]
+    if proposal.about_y == 0:
+        assert f"the edge that is scanned {'first' if first < last else 'last'}" in advice
+    else:
+        assert ("larger" if z[x.argmax()] < z[x.argmin()] else "smaller") in advice
 
 
 def test_simulated_information_is_that_of_a_scan_at_that_tilt():
@@ -85,4 +131,5 @@ def test_simulated_information_is_that_of_a_scan_at_that_tilt():
     scanned = replace(scanned, noise_chol=problem.noise_chol, rotation=exact.rotation)
     expected = motion_information(scanned, at)
     assert (found[0] - expected).norm() / expected.norm() < 0.1
-    assert weighed_directions(found[1], 0.05).share[0] == pytest.approx(1.0, abs=1e-6)
+    precision = found[1] + torch.eye(3).double() / 0.05**2
+    assert principal_directions(torch.linalg.inv(precision), 0.05).share[0] == pytest.approx(1.0, abs=1e-6)
