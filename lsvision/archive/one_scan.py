@@ -15,8 +15,8 @@ from lsvision.archive.lock import sole_run
 from lsvision.archive.planned import PlannedScan, Processing, plan_scan
 from lsvision.archive.product import product_path
 from lsvision.archive.sources.calibrations import read_calibrations
-from lsvision.archive.sources.catalogue import SCAN_FILE, Found
-from lsvision.errors import LsvisionError
+from lsvision.archive.sources.catalogue import SCAN_FILE, Found, name_problem
+from lsvision.errors import ConfigError, LsvisionError
 from lsvision.io import MeasuredCells
 from lsvision.types import RefusedVerdict
 
@@ -43,8 +43,9 @@ def plan_one(
         LsvisionError: see ``plan_scan`` and ``read_calibrations``.
     """
     folder = Path(scan).parent if Path(scan).name == SCAN_FILE else Path(scan)
-    found = Found(folder.resolve().name, folder.absolute())
-    stamp_of(found.path)  # of two missing files, the scan is named first
+    found = Found(folder.resolve().name, folder.absolute(), name_problem(str(folder.absolute())))
+    if found.problem is None:
+        stamp_of(found.path)  # of two missing files, the scan is named first
     return plan_scan(found, read_calibrations(calibration, accept), processing)
 
 
@@ -52,7 +53,8 @@ def process_one(planned: PlannedScan, processing: Processing, output: Path, prog
     """Make the product of one scan in this process, on as many threads as torch may use.
 
     The ledger and everything else but the product is hidden in the output while the work goes on, and removed at its
-    end. A run that was interrupted leaves it, and the same run goes on from there.
+    end. A run that was interrupted or killed leaves it; the next of the same scan goes on from there, one of another
+    scan into this output removes it.
 
     Args:
         progress: called with every finished task and its outcome.
@@ -63,6 +65,7 @@ def process_one(planned: PlannedScan, processing: Processing, output: Path, prog
     work = output / WORK_FOLDER / f"correct-{key_of(planned.files.path)[:16]}"
     lock = work.with_suffix(".lock")
     with sole_run(output, lock), _temporary(work, lock):
+        _remove_abandoned(work)
         with Ledger(work / LEDGER_FILE) as ledger, InProcessEngine() as engine:
             place = Place(ledger, output, work, processing, keep_depth=False)
             (row,) = process_scans([planned], engine, place, progress)
@@ -70,6 +73,16 @@ def process_one(planned: PlannedScan, processing: Processing, output: Path, prog
         if row.status == "failed":
             raise LsvisionError(row.error)
     return FinishedProduct(product_path(output, planned.key), measured)
+
+
+def _remove_abandoned(own: Path) -> None:
+    """Remove what killed runs of other scans left beside a run's own folder; those at work hold their locks."""
+    others = {path.with_suffix("") for path in own.parent.glob("correct-*")} - {own}
+    for folder in others:
+        lock = folder.with_suffix(".lock")
+        with suppress(ConfigError, OSError), sole_run(own.parent, lock):
+            shutil.rmtree(folder, ignore_errors=True)
+            lock.unlink()
 
 
 @contextmanager

@@ -1,5 +1,6 @@
 """The product of a scan of an archive: where it lies, how it is laid out, and whether it is whole."""
 
+import logging
 import os
 from dataclasses import asdict
 from pathlib import Path
@@ -14,6 +15,9 @@ from lsvision.io.inside import path_inside
 from lsvision.io.product.layout import ROOT_METADATA
 from lsvision.stages.correction.grid import source_dtype
 from lsvision.stages.correction.uncertainty import drift_per_metre
+from lsvision.stages.disparity.depth import relation_of_scan
+
+log = logging.getLogger(__name__)
 
 _LONGEST_NAME = 200  # a product that is written has 48 characters more, and disks take 255
 
@@ -41,6 +45,12 @@ def product_layout(planned: PlannedScan, processing: Processing, input_sha256: s
         FileFormatError: the scan cannot be read any more.
     """
     scan = read_scan(planned.files.path, repair_encoder=processing.repair_encoder)
+    relation = relation_of_scan(scan, processing.disparity)
+    if relation is not None and relation.rows.whole:
+        log.warning(
+            "%s: the cameras are out of step by %+.2f ± %.2f lines: the right image is matched %+d lines later",
+            scan.path, relation.rows.lines, relation.rows.sigma, relation.rows.whole,
+        )  # fmt: skip
     calibration = planned.calibration.calibration
     motion = calibration.motion
     sideways, in_depth = motion.drift_mm_per_m
@@ -64,6 +74,7 @@ def product_layout(planned: PlannedScan, processing: Processing, input_sha256: s
             "motion_mm_per_m": {"sideways": sideways, "in_depth": in_depth},
             "drift_sigma_mm_per_m": list(drift_per_metre(motion)),
             "disparity": asdict(processing.disparity),
+            **({"pair": relation.metadata} if relation is not None else {}),
             "correction": asdict(planned.correction),
             "key": key,
         },

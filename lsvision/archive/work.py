@@ -19,6 +19,7 @@ from lsvision.archive.depth_store import open_depth_store, remove_partial_chunks
 from lsvision.archive.identity import ScanFiles
 from lsvision.archive.product import damage_of, is_finished
 from lsvision.errors import LsvisionError, ScanChangedError
+from lsvision.image.stereo.relation import PairRelation
 from lsvision.io import (
     MeasuredCells,
     ProductRows,
@@ -32,8 +33,8 @@ from lsvision.stages.correction.config import CorrectionConfig
 from lsvision.stages.correction.correct import Correction
 from lsvision.stages.correction.grid import plan_product
 from lsvision.stages.disparity.config import DisparityConfig
-from lsvision.stages.disparity.depth import depth_of
-from lsvision.types import Motion, ProductGrid, Scan
+from lsvision.stages.disparity.depth import depth_of, relation_of_scan
+from lsvision.types import DepthSource, Motion, ProductGrid, Scan
 
 
 class Work(Protocol):
@@ -101,7 +102,7 @@ class MatchStrip:
         start = self.number * self.config.work_lines
         stop = min(start + self.config.work_lines, self.scan.lines)
         with _planned_files(self.scan):
-            depth = depth_of(_open_scan(self.scan), self.config).read(start, stop)
+            depth = _open_depth(self.scan, self.config).read(start, stop)
         with naming_full_disk(self.depth_store):
             write_depth(self.depth_store, start, depth, with_sigma=self.with_sigma)
         return StripResult(stop - start, MeasuredCells(int(torch.isfinite(depth.z).sum())))
@@ -193,6 +194,7 @@ def _planned_files(files: ScanFiles) -> Iterator[None]:
             files.check_unchanged()  # what was wrong with the files is the change's fault then
     except ScanChangedError:
         _open_scan.cache_clear()
+        _relation.cache_clear()
         _opened = threading.local()  # that of every thread
         raise
 
@@ -206,11 +208,23 @@ def _open_scan(files: ScanFiles) -> Scan:
     return scan
 
 
+def _open_depth(files: ScanFiles, config: DisparityConfig) -> DepthSource:
+    return depth_of(_open_scan(files), config, _relation(files, config))
+
+
+# Measuring it anew for each strip would cost a tenth of matching.
+@lru_cache(maxsize=2)
+def _relation(files: ScanFiles, config: DisparityConfig) -> PairRelation | None:
+    return relation_of_scan(_open_scan(files), config)
+
+
 def _open_correction(source: CorrectionInput) -> Correction:
     """The latest of the thread stays open: neighbouring strips see the same lines at their seam."""
     if getattr(_opened, "source", None) != source:
         scan = _open_scan(source.scan)
-        depth = open_depth_store(source.depth_store) if source.depth_store else depth_of(scan, source.disparity)
+        depth = (
+            open_depth_store(source.depth_store) if source.depth_store else _open_depth(source.scan, source.disparity)
+        )
         motion = Motion(*(torch.tensor(values, dtype=torch.float64) for values in (source.n, source.covariance)))
         if plan_product(scan, motion, source.config) != source.grid:
             raise ScanChangedError(source.scan.path)

@@ -4,6 +4,9 @@ import logging
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
+from typing import Annotated
+
+from pydantic import BeforeValidator
 
 from lsvision import __version__
 from lsvision.errors import CalibrationError, ConfigError, UnusableCalibrationError
@@ -16,16 +19,24 @@ from lsvision.stages.calibration.calibrate import calibrate
 from lsvision.stages.calibration.config import CalibrationConfig
 from lsvision.stages.corners.config import CornersConfig
 from lsvision.stages.corners.find import find_corners
+from lsvision.stages.corners.rows import row_difference
 from lsvision.types import Board, BoardCorners, Calibration, Provenance, Scan
 
 log = logging.getLogger(__name__)
 
 
+def _as_list(value: object) -> object:
+    return [value] if isinstance(value, str) else value
+
+
 @dataclass(frozen=True, kw_only=True)
 class CalibrateSettings(RunSettings):
-    """Options of the experiment; ``output`` is the file to write, ``calibration.json`` in the run's folder if None."""
+    """Options of the experiment; ``output`` is the file to write, ``calibration.json`` in the run's folder if None.
 
-    scans: list[Text] = field(default_factory=list)
+    ``scans`` may be the path of a single one.
+    """
+
+    scans: Annotated[list[Text], BeforeValidator(_as_list)] = field(default_factory=list)
     board: Board
     corners: CornersConfig
     calibration: CalibrationConfig
@@ -80,6 +91,14 @@ def find_boards(scans: Sequence[Scan], board: Board, config: CornersConfig) -> l
         for scan in scans:
             found.append(find_corners(scan, board, config))
             bars.advance(bar)
+    for corners in found:
+        difference = row_difference(corners)
+        if difference is not None and difference.is_systematic:
+            log.warning(
+                "%s: the right image shows the corners %+.2f ± %.2f lines later than the left one: the cameras are out "
+                "of step or the rig is not rectified; lines are those of the left camera",
+                corners.scan, difference.lines, difference.sigma,
+            )  # fmt: skip
     return found
 
 

@@ -17,7 +17,11 @@ _VALUE = re.compile(r"(?P<key>[~+]*[\w./@]+=)(?P<value>[^'\"({]*[^\x00-\x7f][^'\
 
 
 def in_one_line(error: BaseException) -> str:
-    """An expected failure in words."""
+    """An expected failure in words, of printable signs alone."""
+    return "".join(sign if sign.isprintable() else repr(sign)[1:-1] for sign in _in_words(error))
+
+
+def _in_words(error: BaseException) -> str:
     if isinstance(error, MissingConfigException):
         group, _, name = (error.missing_cfg_file or "").rpartition("/")
         return f"{group or 'config'}: there is no {name!r}; choose one of {', '.join(error.options or ())}"

@@ -1,8 +1,10 @@
 """``+experiment=correct``: one scan and its calibration -> a product, with pictures."""
 
 import logging
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from typing import Any
 
 from lsvision.archive import Outcome, PlannedScan, Processing, Task, plan_one, process_one, product_rows
 from lsvision.experiments.settings import RunSettings
@@ -44,6 +46,8 @@ class ProductSummary:
 
     ``motion_mm_per_m`` is the sideways and depth motion that was corrected, mm per metre. ``drift_mm_per_m`` is the
     standard deviation of (q_x, q_y, q_z) per metre of the object, mm, that the calibration's uncertainty causes.
+    ``pair`` is how the right image differed from the left one apart from disparity: lines by which it was late, of
+    which whole ones were taken into account, its gain, offset and curve; None where the camera measured the depth.
     """
 
     path: str
@@ -56,6 +60,7 @@ class ProductSummary:
     verdict: Verdict
     motion_mm_per_m: tuple[float, float]
     drift_mm_per_m: tuple[float, ...]
+    pair: dict[str, Any] | None
 
 
 def run_correct(settings: CorrectSettings, folder: Path) -> None:
@@ -80,6 +85,27 @@ def run_correct(settings: CorrectSettings, folder: Path) -> None:
     )  # fmt: skip
     motion = planned.calibration.calibration.motion
     log.info("calibration %s, corrected motion %s", summary.verdict, drift_in_words(motion))
+    if summary.pair is not None:
+        log.info("%s", _pair_in_words(summary.pair))
+
+
+def _pair_in_words(pair: Mapping[str, Any]) -> str:
+    """How the right image differed from the left one."""
+    offset = pair["row_offset_lines"]
+    if offset is None:  # JSON has no NaN
+        rows = "row offset not measured"
+    elif pair["row_offset_used_lines"]:
+        rows = (
+            f"{offset:+.2f} lines out of step with the left one: matched {pair['row_offset_used_lines']:+d} lines "
+            "later, travel and lines are those of the left camera"
+        )
+    else:
+        rows = f"in step with the left one to {offset:+.2f} lines"
+    low, high = pair["right_gain"]
+    bright = (
+        "as bright" if (low, high) == (1.0, 1.0) else f"brought to its brightness by a gain of {low:.2f}..{high:.2f}"
+    )
+    return f"right image {rows}; {bright}"
 
 
 def make_product(planned: PlannedScan, processing: Processing, output: Path, bars: ProgressBars) -> ProductSummary:
@@ -92,6 +118,7 @@ def make_product(planned: PlannedScan, processing: Processing, output: Path, bar
         bars.advance(bar, product_rows(task, outcome))
 
     product = process_one(planned, processing, output, advance)
+    pair = read_product(product.path).metadata.get("pair")
     return ProductSummary(
         path=str(product.path),
         rows=grid.rows,
@@ -103,4 +130,5 @@ def make_product(planned: PlannedScan, processing: Processing, output: Path, bar
         verdict=planned.calibration.calibration.verdict,
         motion_mm_per_m=planned.calibration.calibration.motion.drift_mm_per_m,
         drift_mm_per_m=drift_per_metre(planned.calibration.calibration.motion),
+        pair=dict(pair) if isinstance(pair, Mapping) else None,
     )

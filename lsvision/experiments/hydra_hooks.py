@@ -1,5 +1,6 @@
 """What Hydra calls: the defaults of all options as configuration nodes, and the hook at the end of a sweep."""
 
+import itertools
 import sys
 from pathlib import Path
 from typing import Any
@@ -78,9 +79,25 @@ class SweepReport(Callback):
 
 
 def register_settings() -> None:
-    """Make the nodes known to Hydra; before anything is composed."""
+    """Make the nodes and resolvers known to Hydra; before anything is composed."""
     for plugin in (SettingsSource, SettingsPath):
         Plugins.instance().register(plugin)
+    OmegaConf.register_new_resolver("own_folder", own_folder, use_cache=True, replace=True)
+
+
+def own_folder(path: str) -> str:
+    """Create a folder that no other run has: of two that start within a second, the second gets a number."""
+    for name in itertools.chain([path], (f"{path}_{number}" for number in itertools.count(2))):
+        try:
+            Path(name).mkdir(parents=True)
+        except FileExistsError:
+            if not Path(name).is_dir():
+                return path  # a file among its parents, which Hydra reports
+        except OSError:
+            return path
+        else:
+            return name
+    return path
 
 
 def _experiment_of(config_path: str) -> str:

@@ -1,5 +1,7 @@
 """Brightness of colour and mono lines, on the scale of the sensor or on that of a byte."""
 
+import math
+
 import cv2
 import torch
 from jaxtyping import Float, Shaped, UInt8
@@ -8,6 +10,11 @@ from torch import Tensor
 from lsvision.types import LineImage
 
 _SAMPLED_LINES = 16
+_BRIGHT_SHARE = 0.99  # of the pixels are no brighter than what counts as the brightest
+_HEADROOM = 1.25  # over that, for highlights
+# Bytes are stretched where no more than a quarter of their codes is used: noise grows with them. Fewer than sixteen
+# codes are noise alone.
+_DARK_BITS, _FEWEST_BITS = 6, 4
 
 
 def gray(lines: Shaped[Tensor, "*batch lines width channels"]) -> Float[Tensor, "*batch lines width"]:
@@ -37,15 +44,26 @@ def gray_bytes(lines: Shaped[Tensor, "lines width channels"], white: float = 255
 
 
 def white_level(*images: LineImage) -> float:
-    """Largest value that the pixels of some images can have: 255, or the largest number of as many bits as they use.
+    """Largest number of as many bits as the values of some images use, which becomes white: 255 for bytes.
 
-    Sensors of 10 to 14 bits deliver 16-bit images; sixteen lines spread over each image show how many bits are used.
+    Sensors of 10 to 14 bits deliver 16-bit images, and dark scans use few codes even of bytes. A few lines spread over
+    each image show how many bits are used. The brightest hundredth of their pixels does not count: hot pixels, and line
+    counters that a camera writes into its first pixels.
     """
+    brightest = max(_brightest(sampled_lines(image)) for image in images)
+    bits = int(_HEADROOM * brightest).bit_length()
     if all(image.dtype == torch.uint8 for image in images):
-        return 255.0
-    brightest = 0.0
-    for image in images:
-        lines = image.shape[0]
-        for line in sorted({index * (lines - 1) // (_SAMPLED_LINES - 1) for index in range(_SAMPLED_LINES)}):
-            brightest = max(brightest, float(image.read(line, line + 1).to(torch.float32).max()))
-    return float(2 ** max(8, int(brightest).bit_length()) - 1)
+        return float(2 ** max(bits, _FEWEST_BITS) - 1) if bits <= _DARK_BITS else 255.0
+    return float(2 ** min(max(bits, 8), 16) - 1)
+
+
+def sampled_lines(image: LineImage) -> Float[Tensor, "lines width channels"]:
+    """Sixteen lines at fixed places of an image, or all of a shorter one; float32 on the image's scale."""
+    lines = image.shape[0]
+    chosen = sorted({index * (lines - 1) // (_SAMPLED_LINES - 1) for index in range(_SAMPLED_LINES)})
+    return torch.cat([image.read(line, line + 1).to(torch.float32) for line in chosen])
+
+
+def _brightest(sampled: Tensor) -> float:
+    values = sampled.amax(-1).flatten()
+    return float(values.kthvalue(max(1, math.ceil(_BRIGHT_SHARE * len(values)))).values)

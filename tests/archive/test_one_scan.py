@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from lsvision.archive import EngineConfig, plan_one, process_one
+from lsvision.archive import EngineConfig, plan_one, process_one, sole_run
 from lsvision.archive.work import CorrectStrip, FinishProduct
 from lsvision.errors import LsvisionError, ScansFailedError
 from lsvision.experiments.correct import CorrectSettings, run_correct
@@ -50,6 +50,10 @@ def ignore(task: object, outcome: object) -> None:
     pass
 
 
+def interrupt_at_once(task: object, outcome: object) -> None:
+    raise KeyboardInterrupt
+
+
 def content(folder: Path) -> dict[str, bytes]:
     return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
@@ -90,6 +94,22 @@ def test_an_interrupted_run_goes_on_where_it_stood(archive, calibration, tmp_pat
     assert [path.name for path in (tmp_path / "o").iterdir()] == ["b.zarr"]
     process_one(planned, processing, tmp_path / "undisturbed", ignore)
     assert_same_products(tmp_path / "undisturbed", tmp_path / "o")
+
+
+def test_what_a_killed_run_left_goes_with_the_next(archive, calibration, tmp_path):
+    """That of another scan; one that is at work stays."""
+    planned = plan_one(archive / "a", calibration, PROCESSING)
+    with pytest.raises(KeyboardInterrupt):
+        process_one(planned, PROCESSING, tmp_path / "o", interrupt_at_once)
+    work = tmp_path / "o" / ".work"
+    (left,) = work.glob("correct-*")
+    (work / "correct-0123").mkdir()
+    with sole_run(tmp_path / "o", work / "correct-0123.lock"):
+        process_one(plan_one(archive / "b", calibration, PROCESSING), PROCESSING, tmp_path / "o", ignore)
+        assert not left.exists()
+        assert (work / "correct-0123").is_dir()
+    process_one(plan_one(archive / "b", calibration, PROCESSING), PROCESSING, tmp_path / "o", ignore)
+    assert [path.name for path in (tmp_path / "o").iterdir()] == ["b.zarr"]
 
 
 def test_a_product_is_replaced_by_one_of_the_same_scan_only(calibration, tmp_path):

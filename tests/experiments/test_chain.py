@@ -1,8 +1,10 @@
 """simulate -> calibrate -> correct through files, at an eighth of the camera's pixels."""
 
 import json
+import shutil
 
 import pytest
+import tifffile
 import torch
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
@@ -13,6 +15,7 @@ from lsvision.io import read_calibration, read_product, read_scan
 from lsvision.run import config_folder
 from lsvision.stages.measurement import measure_board
 from lsvision.types import Board, DepthView, ProductGrid, TensorImage
+from tests.archive.archives import make_calibration
 
 TILTS = {"a": (2.0, 1.5, 0.0), "b": (-5.0, 1.0, 6.0), "c": (4.0, -3.0, -8.0)}
 
@@ -74,6 +77,25 @@ def test_calibrate_finds_the_motion_and_correct_makes_the_board_square(scans, co
     summary = json.loads((tmp_path / "corrected" / "summary.json").read_text())
     assert summary["rows"] == rows
     assert 0.5 < summary["valid_share"] <= 1
+    assert summary["pair"] == product.metadata["pair"]
+    assert abs(summary["pair"]["row_offset_lines"]) < 0.05
+    assert summary["pair"]["right_gain"] == [1.0, 1.0]
+
+
+def test_cameras_out_of_step_are_said(scans, command, tmp_path, capsys):
+    shutil.copytree(scans / "b", tmp_path / "late")
+    scan = read_scan(scans / "b")
+    make_calibration(tmp_path / "calibration.json", (0.0, 1.0, 0.0), scan.rig)
+    right = scan.images.right.read(0, scan.lines)
+    late = right[(torch.arange(scan.lines) - 2).clamp(min=0)]
+    tifffile.imwrite(tmp_path / "late" / "right.tif", late.numpy(), photometric="rgb")
+    options = (f"scan={tmp_path / 'late'}", f"calibration={tmp_path / 'calibration.json'}")
+    assert command("+experiment=correct", *options) == 0
+    said = capsys.readouterr()
+    assert "right image is matched +2 lines later" in said.out + said.err
+    assert "+2.00 lines out of step" in said.out + said.err
+    product = read_product(tmp_path / "run" / "late.zarr")
+    assert product.metadata["pair"]["row_offset_used_lines"] == 2
 
 
 def test_a_board_of_another_size_is_one_line_with_its_verdict_and_its_files_are_written(

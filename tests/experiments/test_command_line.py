@@ -13,6 +13,7 @@ import pytest
 from lsvision.archive import LEDGER_FILE, Ledger, ScanRow, sole_run
 from lsvision.errors import ConfigError
 from lsvision.experiments.command_line import print_any_letter, quoted
+from lsvision.experiments.hydra_hooks import own_folder
 from lsvision.experiments.reprocess import StatusSettings, run_status
 from tests.archive.archives import make_calibration, make_scan
 
@@ -23,7 +24,11 @@ REPROCESS = ("+experiment=reprocess", "calibration=c.json")
     ("overrides", "problem"),
     [
         (["+experiment=corect"], "experiment: there is no 'corect'; choose one of calibrate, "),
-        (["+experiment=calibrate", "scans=DIR"], "scans: expected a list, got 'DIR'"),
+        (["+experiment=calibrate", "scans=DIR"], "error: DIR/scan.yaml: no such file"),
+        (["+experiment=calibrate", "scans=[5]"], "scans[0]: expected text, got 5"),
+        (["+experiment=calibrate", "scans=5"], "scans: expected a list, got 5"),
+        (["+experiment=correct", "scan=a", "calibration=c.json", "export=[obj]"], "export[0]: expected 'tiff', 'ply'"),
+        ([*REPROCESS, "archive=.", "output=o", "engine.workers=-1"], "engine.workers: expected a whole number >= 1"),
         (["+experiment=calibrate", "scans=[a"], "scans=[a: cannot be understood; put quotes"),
         (["+experiment=correct", "scan=a(b", "calibration=c.json"], "scan=a(b: cannot be understood"),
         (["+experiment=calibrate", "calibration.metod=joint"], "Could not override 'calibration.metod'."),
@@ -161,3 +166,10 @@ def test_ctrl_c_ends_the_program_with_130(tmp_path):
     assert process.returncode == 130
     assert errors.splitlines()[-1].startswith("interrupted: ")
     assert "Traceback" not in errors
+
+
+def test_two_runs_within_a_second_have_a_folder_each(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert [own_folder("a/b") for _ in range(3)] == ["a/b", "a/b_2", "a/b_3"]
+    (tmp_path / "file").touch()
+    assert own_folder("file/b") == "file/b"  # which Hydra reports

@@ -56,7 +56,11 @@ class LocalEngine:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         for pool in [*self._idle, *(pool for _, pool in self._busy.values())]:
+            # What is in progress is not waited for where the run is ended: a piece that is lost does no harm.
+            processes = list((pool._processes or {}).values())
             pool.shutdown(wait=kind is None, cancel_futures=True)
+            for process in processes if kind is not None else ():
+                process.terminate()
 
     @property
     def capacity(self) -> int:
@@ -107,11 +111,7 @@ class LocalEngine:
 
     def _after_crash(self, task: Task | None) -> Finished | None:
         if task is None:
-            self._failed_starts += 1
-            if self._failed_starts > MAX_FAILED_STARTS:
-                raise LsvisionError(
-                    f"workers do not start: {self._failed_starts} of them ended before their first task"
-                )
+            self._count_failed_start()
             return None
         self._crashes[task] = self._crashes.get(task, 0) + 1
         if self._crashes[task] >= MAX_WORKER_CRASHES:
@@ -120,13 +120,24 @@ class LocalEngine:
         self._waiting.appendleft(task)
         return None
 
+    def _count_failed_start(self) -> None:
+        self._failed_starts += 1
+        if self._failed_starts > MAX_FAILED_STARTS:
+            raise LsvisionError(f"workers do not start: {self._failed_starts} of them ended before their first task")
+
     def _replace(self, pool: ProcessPoolExecutor) -> None:
         pool.shutdown(wait=False)
         self._start_worker()
 
     def _start_worker(self) -> None:
-        pool = ProcessPoolExecutor(1, mp_context=self._context, initializer=_enter_worker)
-        self._busy[pool.submit(os.getpid)] = None, pool
+        while True:
+            pool = ProcessPoolExecutor(1, mp_context=self._context, initializer=_enter_worker)
+            try:
+                self._busy[pool.submit(os.getpid)] = None, pool
+                return
+            except (OSError, EOFError, BrokenProcessPool):  # the server that workers are forked from was killed
+                pool.shutdown(wait=False)
+                self._count_failed_start()
 
 
 def _forget_stdin() -> None:

@@ -17,6 +17,8 @@ from lsvision.io.inside import path_inside
 PATTERN_SIGNS = "*?["
 COPIES_FILE = ".copied.json"  # in a folder of copies, what they are copies of
 
+_CONTROL = ("Cc", "Zl", "Zp")  # Unicode's categories of control characters and of ends of lines and paragraphs
+
 _Place = tuple[Path, str | None]
 
 
@@ -94,15 +96,24 @@ def _without_parents(place: Path) -> Path:
 def _found(place: Path, root: Path, problem: str | None) -> Found:
     """A place with its key, and what is wrong with its name."""
     key, path = _key(place, root), place.absolute()
-    try:
-        f"{key} {path}".encode()
-    except UnicodeEncodeError:
-        return Found(on_one_line(key), Path(on_one_line(path)), problem or "its name is not UTF-8; rename it")
+    if (fault := name_problem(f"{key} {path}")) is not None:
+        return Found(on_one_line(key), Path(on_one_line(path)), problem or fault)
     if any(part.casefold().endswith(".zarr") for part in Path(key).parts[:-1]):
         problem = problem or "lies in a folder whose name ends in .zarr, as those of products do"
     if Path(key).parts[:1] == (".work",):
         problem = problem or "lies in a folder .work, where unfinished products are kept"
     return Found(key, path, problem or _problem_of_copy(place, root))
+
+
+def name_problem(name: str) -> str | None:
+    """What is wrong with a name that no terminal, ledger or other program could show as it is."""
+    try:
+        name.encode()
+    except UnicodeEncodeError:
+        return "its name is not UTF-8; rename it"
+    if any(unicodedata.category(sign) in _CONTROL for sign in name):
+        return "its name has control characters; rename it"
+    return None
 
 
 def _problem_of_copy(place: Path, root: Path) -> str | None:

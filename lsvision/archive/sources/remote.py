@@ -3,6 +3,7 @@
 import json
 import posixpath
 import re
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -54,10 +55,12 @@ def _copy(files: fsspec.AbstractFileSystem, place: str, copies: Path) -> None:
     scans = sorted({str(found) for name in names for found in files.glob(f"{name}/{SCAN_FILE}")})
     if not scans:
         raise ConfigError(f"archive: no scans at {place}")
-    stamps, root = _stamps(files, scans, _fixed_part(place))
-    now = {posixpath.relpath(_rooted(path), root): (path, stamp) for path, stamp in stamps.items()}
+    found, root = _files_of(files, scans, _fixed_part(place))
+    now = {posixpath.relpath(_rooted(path), root): (path, _stamp(details)) for path, details in found.items()}
     targets = {name: path_inside(copies, name) for name in now}
     before = _copied_before(copies)
+    changed = [path for name, (path, stamp) in now.items() if before.get(name) != stamp]
+    _check_room(copies, sum(int(found[path].get("size") or 0) for path in changed))
     for name in before.keys() - now.keys():
         path_inside(copies, name).unlink(missing_ok=True)
     kept = {}
@@ -69,6 +72,14 @@ def _copy(files: fsspec.AbstractFileSystem, place: str, copies: Path) -> None:
         kept[name] = stamp
     if kept != before:
         write_json(copies / COPIES_FILE, kept)
+
+
+def _check_room(folder: Path, needed: int) -> None:
+    """Check that a disk has room for some bytes, before they are copied: entries of a ZIP can claim any size."""
+    there = next(parent for parent in (folder, *folder.absolute().parents) if parent.is_dir())
+    free = shutil.disk_usage(there).free
+    if needed > free:
+        raise ConfigError(f"archive: its copies take {needed / 1e9:.1f} GB, {there} has room for {free / 1e9:.1f} GB")
 
 
 def _copied_before(copies: Path) -> dict[str, str]:
@@ -86,8 +97,8 @@ def _fixed_part(place: str) -> str:
     return place if fixed == place else posixpath.dirname(fixed)
 
 
-def _stamps(files: fsspec.AbstractFileSystem, scans: list[str], place: str) -> tuple[dict[str, str], str]:
-    """Every file of some scans with a text that changes with it, and the folder that holds all: the archive's root.
+def _files_of(files: fsspec.AbstractFileSystem, scans: list[str], place: str) -> tuple[dict[str, dict[str, Any]], str]:
+    """Every file of some scans with what is known of it, and the folder that holds all: the archive's root.
 
     The rigs beside or above the scans are among them, where they lie in the archive too.
     """
@@ -100,7 +111,7 @@ def _stamps(files: fsspec.AbstractFileSystem, scans: list[str], place: str) -> t
         if rig not in found and not rig.startswith("..") and _common([limit, rig]) == limit and files.exists(rig):
             found[rig] = files.info(rig)
             parents.append(posixpath.dirname(rig))
-    return {str(path): _stamp(details) for path, details in found.items()}, _common(parents)
+    return {str(path): details for path, details in found.items()}, _common(parents)
 
 
 def _common(paths: list[str]) -> str:

@@ -6,11 +6,13 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from lsvision.image.board.correlated_noise import Residuals, corner_covariance, possible_covariance
 from lsvision.image.board.saddle import SaddleFit, SaddleOptions, fit_saddles
 from lsvision.image.brightness import gray
 from lsvision.types import LineImage
 
 _READ_LINES = 512
+_MODEL_PX = 0.001  # a pixel's box is no Gaussian: the error that a sharp image without noise or texture leaves
 _INTO_SQUARES = 0.4  # share of a square that a window takes in: blur and shift stay clear of the next edges
 _FEWEST_PIXELS = 49  # of the squares in a window
 # How far the fit of a window may be from the board's median: a corner under glare, smear or dirt is another picture.
@@ -19,11 +21,29 @@ _WORST_RESIDUAL, _WORST_BLUR, _LEAST_CONTRAST = 3.0, 2.0, 0.3
 
 @dataclass(frozen=True)
 class DetectedCorners:
-    """Corners of one board in one image, in the board's order: (column, line) px, covariance px², valid or not."""
+    """Corners of one board in one image, in the board's order: (column, line) px, covariance px², valid or not.
+
+    ``residuals`` is what the fits left of their windows, where it is known.
+    """
 
     position: Float[Tensor, "corners 2"]
     covariance: Float[Tensor, "corners 2 2"]
     valid: Bool[Tensor, " corners"]
+    residuals: Residuals | None = None
+
+    def covariance_with(self, other: "DetectedCorners") -> Float[Tensor, "corners 2 2"]:
+        """Covariance, px², of the errors in this image with those of the same corners in another.
+
+        Both images show the texture of the board: much of their error is the same.
+        """
+        covariance = torch.zeros_like(self.covariance)
+        if self.residuals is None or other.residuals is None:
+            return covariance
+        both = self.valid & other.valid
+        if bool(both.any()):
+            mixed = corner_covariance(self.residuals.of(both), other.residuals.of(both))
+            covariance[both] = possible_covariance(mixed, self.covariance[both], other.covariance[both])
+        return covariance
 
 
 @dataclass(frozen=True)
@@ -66,7 +86,7 @@ def refine_grid(
 
     A window reaches into the four squares around its corner, at any angle, shear and stretch, and at most
     ``largest_radius`` px: past it the board's texture weighs more than what is gained. A ``plain`` fit is good to a few
-    hundredths of a pixel.
+    hundredths of a pixel; its covariance is that of independent noise.
     """
     steps = GridSteps.of(grid)
     radius = steps.window_radius(largest_radius)
@@ -77,13 +97,14 @@ def refine_grid(
         windows, steps.normal_angles().to(windows), steps.within_squares(radius), SaddleOptions(plain=plain)
     )
     valid = _like_the_board(fit, fit.valid & inside)
-    # The surface's texture is the same all over the board, and the gain of one window is a rough figure.
-    covariance = fit.correlation_gain[valid].mean() * fit.covariance
-    return DetectedCorners(
-        torch.where(valid[:, None], centre + fit.position, torch.nan),
-        torch.where(valid[:, None, None], covariance, torch.nan),
-        valid,
-    )
+    covariance = torch.full_like(fit.covariance, torch.nan)
+    if plain:
+        covariance[valid] = fit.covariance[valid]
+    elif bool(valid.any()):
+        residuals = fit.residuals.of(valid)
+        covariance[valid] = corner_covariance(residuals, residuals) + _MODEL_PX**2 * torch.eye(2).to(windows)
+    position = torch.where(valid[:, None], centre + fit.position, torch.nan)
+    return DetectedCorners(position, covariance, valid, fit.residuals)
 
 
 def lies_within(image: LineImage, centre: Int[Tensor, "corners 2"], radius: int) -> Bool[Tensor, " corners"]:

@@ -1,12 +1,14 @@
 """Sub-pixel position of checkerboard corners: a parametric fit of the blurred saddle by Levenberg-Marquardt."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from lsvision.image.board.correlated_noise import correlation_gain
+from lsvision.image.board.correlated_noise import Residuals
 from lsvision.image.board.levenberg_marquardt import Linearisation, NormalMatrix, Windows, fit_parameters
 from lsvision.image.board.saddle_model import FULL, PARAMETERS, PLAIN, POSITION, Saddle, SaddleParameters
 
@@ -20,13 +22,13 @@ _SMALLEST_CROSSING = 0.2  # sine of the angle between edges: nearly parallel one
 class SaddleFit:
     """Fitted corners: ``position (corners, 2)`` as (u, v) px from the window's centre, and whether each is a corner.
 
-    ``covariance``, px², is that of independent noise in the pixels; where the residuals are correlated, as a surface's
-    texture is, the variance is ``correlation_gain`` times as large. One window's gain is a rough figure: average it.
+    ``covariance``, px², is that of independent noise in the pixels; where it is correlated, as a surface's texture is,
+    ``correlated_noise.corner_covariance`` finds the covariance from the ``residuals`` of a board's fits.
     """
 
     position: Float[Tensor, "corners 2"]
     covariance: Float[Tensor, "corners 2 2"]
-    correlation_gain: Float[Tensor, " corners"]
+    residuals: Residuals
     blur_px: Float[Tensor, " corners"]
     contrast: Float[Tensor, " corners"]
     residual: Float[Tensor, " corners"]
@@ -71,7 +73,13 @@ def fit_saddles(
     together = max(1, _TOGETHER // (PARAMETERS * windows.shape[-1] ** 2))
     parts = zip(windows.split(together), angles.split(together), mask.split(together), strict=True)
     fits = [_fit_together(Windows.of_pixels(pixels, inside), turned, options) for pixels, turned, inside in parts]
-    return SaddleFit(*(torch.cat([getattr(fit, item.name) for fit in fits]) for item in fields(SaddleFit)))
+    return _joined(SaddleFit, fits)
+
+
+def _joined(kind: type, parts: Sequence[Any]) -> Any:
+    """Fits of several parts as one, field by field."""
+    values = ([getattr(part, item.name) for part in parts] for item in fields(kind))
+    return kind(*(torch.cat(value) if isinstance(value[0], Tensor) else _joined(Residuals, value) for value in values))
 
 
 def _fit_together(windows: Windows, angles: Tensor, options: SaddleOptions) -> SaddleFit:
@@ -86,7 +94,7 @@ def _fit_together(windows: Windows, angles: Tensor, options: SaddleOptions) -> S
     return SaddleFit(
         position=parameters.position,
         covariance=inverse_normal[:, POSITION, POSITION] * variance[:, None, None],
-        correlation_gain=correlation_gain(fitted.jacobian, inverse_normal, POSITION, fitted.residual, variance),
+        residuals=Residuals(fitted.residual, windows.weight, fitted.jacobian, inverse_normal, parameters.position),
         blur_px=parameters.blur,
         contrast=parameters.contrast.abs(),
         residual=variance.sqrt(),

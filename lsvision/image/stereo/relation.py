@@ -11,16 +11,17 @@ from functools import cached_property
 
 import cv2
 import torch
-from jaxtyping import UInt8
+from jaxtyping import Shaped, UInt8
 from torch import Tensor
 
-from lsvision.image.brightness import gray_bytes, white_level
+from lsvision.image.brightness import gray_bytes
+from lsvision.image.levels import PairLevels
 from lsvision.image.stereo.exposure import Exposure, fit_exposure
 from lsvision.image.stereo.refine import RefineOptions, refine_disparity
 from lsvision.image.stereo.rows import RowOffset, Tiles, joined, row_offset
 from lsvision.image.stereo.sgbm import GrayPair, Search, match_sgbm
 from lsvision.image.stereo.warp import warp_cubic
-from lsvision.types import LineImage
+from lsvision.types import StereoPair
 
 _LINES_PER_BAND, _MOST_BANDS = 1024, 8
 _BAND_PX, _FEWEST_LINES, _MOST_LINES = 2**19, 64, 256  # of a band
@@ -38,14 +39,18 @@ class PairRelation:
     """What is to be done to a right image before it is matched.
 
     Args:
-        white: the largest value that pixels of either image can have.
+        levels: what the codes of both images mean.
         rows: by how many lines the cameras are out of step; whole ones are taken into account.
         exposure: what makes the right image as bright as the left one; None where it is.
     """
 
-    white: float
+    levels: PairLevels
     rows: RowOffset
     exposure: Exposure | None
+
+    def as_bright_as_left(self, right: Shaped[Tensor, "lines width"]) -> Shaped[Tensor, "lines width"]:
+        """Lines of the right image, of 255, as bright as the left image has the same samples."""
+        return right if self.exposure is None else self.exposure.apply(right)
 
     @property
     def metadata(self) -> dict[str, object]:
@@ -61,7 +66,7 @@ class PairRelation:
         }
 
 
-def measure_relation(left: LineImage, right: LineImage, search: Search, noise: float, size: int) -> PairRelation:
+def measure_relation(images: StereoPair, search: Search, noise: float, size: int) -> PairRelation:
     """Measure how the right image of a scan differs from the left one.
 
     Args:
@@ -69,10 +74,10 @@ def measure_relation(left: LineImage, right: LineImage, search: Search, noise: f
         noise: sigma of the noise of grey values, of 255.
         size: of the images over that of the copies that are matched.
     """
-    white = white_level(left, right)
-    bands = [band for band in _bands(left, right, white, size) if not band.is_blank(noise)]
+    levels = PairLevels.of(images)
+    bands = [band for band in _bands(images, levels.white, size) if not band.is_blank(noise)]
     if not bands:
-        return PairRelation(white, RowOffset(math.nan, math.nan), None)
+        return PairRelation(levels, RowOffset(math.nan, math.nan), None)
     views = _Views(bands, search.reduced(size), noise)
     shift = views.best_shift()
     for _ in range(_MOST_ROUNDS):
@@ -80,7 +85,7 @@ def measure_relation(left: LineImage, right: LineImage, search: Search, noise: f
         if rows.whole == shift or abs(rows.whole) > bands[0].margin:
             break
         shift = rows.whole
-    return PairRelation(white, rows, _exposure(views.at(shift)))
+    return PairRelation(levels, rows, _exposure(views.at(shift)))
 
 
 @dataclass(frozen=True)
@@ -125,8 +130,9 @@ class _Band:
         return torch.from_numpy(cv2.resize(whole, (columns, lines), interpolation=cv2.INTER_AREA))
 
 
-def _bands(left: LineImage, right: LineImage, white: float, size: int) -> list[_Band]:
+def _bands(images: StereoPair, white: float, size: int) -> list[_Band]:
     """Bands of lines at equal distances; none of images that are too low for one."""
+    left, right = images.left, images.right
     lines, width = left.shape[:2]
     margin = min(_LARGEST_SHIFT, lines // 8)
     height = min(max(_BAND_PX // width, _FEWEST_LINES), _MOST_LINES, lines - 2 * margin)

@@ -20,6 +20,7 @@ NUMPY_DTYPES: dict[torch.dtype, np.dtype] = {torch_dtype: dtype for dtype, torch
 
 # Holds the overlap of neighbouring reads; 1500 lines of a 7142 px colour camera.
 _CACHE_BYTES = 32 * 2**20
+_MOST_BAND_BYTES = 2**30  # a frame of 30 000 lines of 7142 px has two thirds of it
 
 
 class Bands(Protocol):
@@ -36,6 +37,17 @@ class Bands(Protocol):
     def decode(self, band: int) -> NDArray:
         """The lines of one band, (lines, width, channels) as stored."""
         ...
+
+
+def check_band_bytes(path: Path, what: str, size: int) -> None:
+    """Check what has to be decoded at once, in bytes.
+
+    Raises:
+        FileFormatError: it is more than any image of a camera needs; a file of any size may claim it.
+    """
+    if size > _MOST_BAND_BYTES:
+        limit = f"expected pieces of at most {_MOST_BAND_BYTES >> 20} MB"
+        raise FileFormatError(path, f"{limit} to be decoded at once, {what} takes {size >> 20} MB")
 
 
 def even_edges(lines: int, band_lines: int) -> NDArray[np.int64]:
@@ -58,6 +70,9 @@ class BandedImage:
             raise FileFormatError(bands.path, f"expected 1 or 3 channels (or 4 with alpha), got {channels}")
         if bands.dtype not in TORCH_DTYPES:
             raise FileFormatError(bands.path, f"expected uint8, uint16 or float32, got {bands.dtype}")
+        most = int(np.diff(bands.edges).max())
+        size = most * width * channels * bands.dtype.itemsize
+        check_band_bytes(bands.path, f"one of {most} lines of {width} px", size)
         self._bands = bands
         self._shape = (lines, width, min(channels, 3))
         self._cache: OrderedDict[int, NDArray] = OrderedDict()

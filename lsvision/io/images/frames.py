@@ -11,7 +11,7 @@ from PIL.BmpImagePlugin import BmpImageFile
 from PIL.PngImagePlugin import PngImageFile
 
 from lsvision.errors import FileFormatError
-from lsvision.io.images.bands import BandedImage
+from lsvision.io.images.bands import BandedImage, check_band_bytes
 from lsvision.io.images.tiff import TiffBands
 
 FRAME_SUFFIXES = (".png", ".bmp", ".tif", ".tiff")
@@ -40,11 +40,12 @@ class FrameBands:
         self._frames = sorted(frames, key=_natural)
         _check_kinds(path, self._frames)
         sizes = [_frame_size(frame) for frame in self._frames]
-        for frame, (_, width) in zip(self._frames, sizes, strict=True):
+        for frame, (lines, width) in zip(self._frames, sizes, strict=True):
             if width != sizes[0][1]:
                 raise FileFormatError(
                     frame, f"expected {sizes[0][1]} columns as {self._frames[0].name} has, got {width}"
                 )
+            check_band_bytes(frame, f"one of {lines} lines", lines * width)
         first = _decode_frame(self._frames[0])
         self.edges = np.cumsum([0, *(lines for lines, _ in sizes)], dtype=np.int64)
         _check_sequence(path, self._frames, self.edges[:-1])

@@ -24,6 +24,10 @@ STRIP_LINES = 256
 ZSTD_LEVEL = 1
 
 
+# Those that decode into a buffer of the right size, whatever a damaged file says, and JPEG, whose size is checked.
+COMPRESSIONS = ("NONE", "LZW", "DEFLATE", "ADOBE_DEFLATE", "PACKBITS", "LZMA", "ZSTD", "ZSTD_DEPRECATED", "JPEG")
+
+
 class TiffBands:
     """The strips, or rows of tiles, of a TIFF of one page.
 
@@ -63,6 +67,8 @@ class TiffBands:
     def _segment(self, file: Any, index: int) -> NDArray:
         file.seek(self._offsets[index])
         data = file.read(self._counts[index])
+        if self._is_jpeg and _jpeg_pixels(data) > self._segment_pixels:
+            raise FileFormatError(self.path, f"the JPEG image of strip or tile {index} is larger than that")
         pixels, *_ = self._decode(data, index, **self._tables)
         return pixels[0]
 
@@ -77,6 +83,9 @@ class TiffBands:
                 f"expected the first line at the top and the first column at the left, got orientation {orientation}"
             )
             raise FileFormatError(self.path, problem)
+        if page.compression.name not in COMPRESSIONS:
+            problem = f"expected an image that is plain or compressed by {', '.join(COMPRESSIONS[1:])}"
+            raise FileFormatError(self.path, f"{problem}, got {page.compression.name}")
         if page.imagedepth != 1 or page.dtype is None:
             raise FileFormatError(self.path, "expected a two-dimensional image of plain numbers")
         self.layout = (page.imagelength, page.imagewidth, page.samplesperpixel)
@@ -84,6 +93,8 @@ class TiffBands:
         self._offsets, self._counts = tuple(page.dataoffsets), tuple(page.databytecounts)
         self._across = -(-page.imagewidth // page.tilewidth) if page.is_tiled else 1
         band_lines = page.tilelength if page.is_tiled else min(page.rowsperstrip, page.imagelength)
+        self._segment_pixels = band_lines * (page.tilewidth if page.is_tiled else page.imagewidth)
+        self._is_jpeg = page.compression.name == "JPEG"
         self._raw_dtype = None
         if page.is_final:  # uncompressed and contiguous, often a single strip: any lines can be read
             self._raw_dtype = self.dtype.newbyteorder(page.parent.byteorder)
@@ -105,6 +116,18 @@ class TiffBands:
         size = self.path.stat().st_size
         if last_byte > size:
             raise FileFormatError(self.path, f"cut short: its data reach to byte {last_byte}, the file ends at {size}")
+
+
+def _jpeg_pixels(data: bytes) -> int:
+    """Pixels of a JPEG image by its frame header, ITU-T T.81 B.2.2; 0 where there is none, which no decoder takes."""
+    place = 2
+    while place + 9 <= len(data) and data[place] == 0xFF:
+        marker, length = data[place + 1], int.from_bytes(data[place + 2 : place + 4], "big")
+        if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
+            lines, width = (int.from_bytes(data[place + at : place + at + 2], "big") for at in (5, 7))
+            return lines * width
+        place += 1 if marker == 0xFF else 2 + length
+    return 0
 
 
 def write_line_image(

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from lsvision.errors import FileFormatError
 from lsvision.io.images.bands import even_edges
+from lsvision.io.images.chunk_size import check_chunks
 
 _METADATA_FILES = ("zarr.json", ".zarray", ".zgroup")
 
@@ -46,5 +47,6 @@ class ZarrBands:
 
     def decode(self, band: int) -> NDArray:
         """The lines of one row of chunks, (lines, width, channels)."""
+        check_chunks(self.path, self._array, 0, (int(self.edges[band]), int(self.edges[band + 1])))
         pixels = np.asarray(self._array[int(self.edges[band]) : int(self.edges[band + 1])])
         return pixels.astype(self.dtype, copy=False).reshape(-1, *self.layout[1:])

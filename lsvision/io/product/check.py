@@ -8,6 +8,7 @@ import torch
 import zarr
 
 from lsvision.errors import FileFormatError, LsvisionError
+from lsvision.io.images.chunk_size import check_chunks
 from lsvision.io.product.layout import image_names
 from lsvision.io.product.measured import MeasuredCells
 from lsvision.io.product.pyramid import level_shape, multiscales
@@ -75,6 +76,7 @@ def _check_level(product: Product, key: str, array: Any, shape: tuple[int, int])
         raise FileFormatError(product.path, f"{missing} of {array.nchunks} chunks are missing", key)
     step = array.chunks[-2]
     for row in range(0, shape[0], step):
+        check_chunks(product.path / key, array, array.ndim - 2, (row, min(row + step, shape[0])))
         try:
             array[..., row : row + step, :]
         except Exception as error:  # on damaged data each codec raises a type of its own

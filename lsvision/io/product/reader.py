@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from lsvision.errors import FileFormatError
+from lsvision.io.images.chunk_size import check_chunks
 from lsvision.io.product.layout import FULL_LEVEL, PRODUCT_FORMAT, image_names
 from lsvision.schema import shown
 from lsvision.types import ProductGrid, ProductStrip
@@ -83,6 +84,7 @@ class Product:
         if not 0 <= start <= stop <= self.grid.rows:
             raise ValueError(f"start, stop: expected a range within 0..{self.grid.rows}, got {start}..{stop}")
         array = zarr.open_array(self.path / name / FULL_LEVEL, mode="r")
+        check_chunks(self.path / name / FULL_LEVEL, array, array.ndim - 2, (start, stop))
         block = np.asarray(array[..., start:stop, :])
         return torch.from_numpy(np.ascontiguousarray(np.moveaxis(block, 0, -1) if block.ndim == 3 else block))
 

@@ -14,6 +14,7 @@ from lsvision.geometry import sharp_depth_mm
 from lsvision.stages.calibration.batch import BatchCalibration, errors_along_scan_of, iterations_of
 from lsvision.stages.calibration.config import CalibrationConfig
 from lsvision.stages.calibration.correlated import ErrorsAlongScan
+from lsvision.stages.calibration.exchanged import images_exchanged
 from lsvision.stages.calibration.findings import find_flaws
 from lsvision.stages.calibration.hypotheses import Assumed
 from lsvision.stages.calibration.measurements import BoardMeasurements, SoundProblem
@@ -60,16 +61,19 @@ def calibrate(boards: Sequence[BoardCorners], rig: Rig, config: CalibrationConfi
     known = Known(batch.covariance, config.prior_sigma, scale, depth_mm)
     observability = observe(solution.weighed, solution.posterior.mean, known)
     iterations, converged = iterations_of(batch), bool(batch.converged)
+    before_mm, after_mm = iterations[0].rmse_mm, iterations[-1].rmse_mm
     assumed = Assumed(config.prior_sigma, config.board_scale_sigma)
     findings = find_flaws(boards, solution.problem, solution.start, solution.outlying, assumed)
-    contradictions = [*findings.contradictions, *rmse_grew(iterations[0].rmse_mm, iterations[-1].rmse_mm)]
     along_scan = errors_along_scan_of(batch)
+    contradictions = [*findings.contradictions, *rmse_grew(before_mm, after_mm)]
+    if scale > 1 or along_scan:  # where the residuals are no noise as stated
+        contradictions = images_exchanged(boards, rig, config, after_mm) or contradictions
     judged = judge(not_settled(converged, int(batch.iterations)), contradictions, observability)
     return Calibration(
         method=config.method,
         motion=Motion(batch.n, batch.covariance),
-        rmse_before_mm=iterations[0].rmse_mm,
-        rmse_after_mm=iterations[-1].rmse_mm,
+        rmse_before_mm=before_mm,
+        rmse_after_mm=after_mm,
         iterations=iterations,
         boards=_board_fits(boards, batch, solution),
         observability=observability,

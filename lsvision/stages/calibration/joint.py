@@ -102,7 +102,7 @@ def widened_where_open(
 def _by_mode(problem: BoardProblem, prior: Prior, begin: Tensor, config: CalibrationConfig) -> Posterior:
     """The mode with the second moment about it; the best state on the way to it where it was not found."""
     mode, further = mode_of(problem, prior, begin, config), rows_of(prior)
-    spread = spread_along_turn(problem, further, mode)
+    spread = spread_along_turn(problem, further, mode, config.prior_sigma)
     first, last = gauss_newton_step(problem, further, begin), mode.here
     better = last.cost <= first.cost  # not so where the last is not finite
     state = torch.where(better[..., None], mode.state, begin)

@@ -1,11 +1,13 @@
 """The spread of a posterior along the turn that boards hardly show, where no tangent holds.
 
-A turn of all boards about the scan line and the same turn of n, φ = atan(n3 / n2), look alike: the states that fit lie
-on a curve, which over the prior's range of φ departs from its tangent by thousands of sigmas. Given φ, all else is
-known so well that the model is linear. So the posterior is a mixture over φ of Gaussians about the most likely states
-given φ, each weighed by its probability, and its second moment needs no linearisation along the curve.
+A turn ψ of all boards about the scan line, and the change of n that goes with it, look alike: the states that fit lie
+on a curve, which over the prior's range departs from its tangent by thousands of sigmas. (In the plane of n2 and n3 it
+is a circle, about the n3 that would make one flat board appear as it does.) Given ψ, all else is known so well that the
+model is linear. So the posterior is a mixture over ψ of Gaussians about the most likely states given ψ, and its second
+moment needs no linearisation along the curve. Each is weighed by its likelihood and prior alone: the volume that is
+left to the poses would prefer a large n2, as their flat prior is one at travel zero, and is no knowledge of ψ.
 
-Source: Rue, Martino & Chopin 2009 (nested Laplace approximation); Golub & Welsch 1969 (nodes and weights).
+Source: Rue, Martino & Chopin 2009 (nested approximation); Golub & Welsch 1969 (nodes and weights).
 """
 
 from dataclasses import dataclass
@@ -19,10 +21,9 @@ from lsvision.estimation import apply, lower_factor
 from lsvision.stages.calibration.mode import FurtherRows, Mode, find_mode, step_from
 from lsvision.stages.calibration.problem import BoardProblem, BoardState
 
-# Nodes over φ: exact for a mixture whose moments are polynomials of degree 13 in φ. With five, one of 600 sets under a
-# prior of 0.3 had a wrong covariance; seven and nine agree to a hundredth.
-_NODES = 7
-# Sigma of φ, rad, that holds a node in its place: far below what any scan shows of it.
+# Nodes over ψ. Under a prior of 0.05 five give the sigmas of nine in every direction to a hundredth.
+_FEW_NODES, _NODES, _WIDE_PRIOR = 5, 7, 0.05
+# Sigma of ψ, rad, that holds a node in its place: far below what any scan shows of it.
 _HELD = 1e-7
 # The largest distance of a node, rad: at a right angle the object would not move along the scan any more.
 _FARTHEST = 1.3
@@ -43,7 +44,7 @@ class Spread:
 
 @dataclass(frozen=True)
 class _Nodes:
-    """Values of φ at which states are looked for, ``(nodes, *batch)``, where they start, and the log of the weights."""
+    """Values of ψ at which states are looked for, ``(nodes, *batch)``, where they start, and the log of the weights."""
 
     turn: Tensor
     start: Tensor
@@ -61,22 +62,22 @@ def is_curved(problem: BoardProblem, factor: Float[Tensor, "*batch state columns
     return (by_rotation * theta.square().sum((-2, -1))).sum(-1) > _STRAIGHT
 
 
-def spread_along_turn(problem: BoardProblem, further: FurtherRows, mode: Mode) -> Spread:
+def spread_along_turn(problem: BoardProblem, further: FurtherRows, mode: Mode, prior_sigma: float) -> Spread:
     """The second moment about the mode of the posterior over all turns that the boards leave open.
 
     Args:
         further: rows of the prior, as ``find_mode`` had them.
+        prior_sigma: of each component of n.
     """
-    nodes = _nodes(mode)
+    nodes = _nodes(mode, _FEW_NODES if prior_sigma <= _WIDE_PRIOR else _NODES)
 
     def rows(state: Tensor) -> Tensor:
-        """The prior, and φ held at its node."""
+        """The prior, and ψ held at its node."""
         constraint = torch.cat([turn_gradient(state), (nodes.turn - turn(state))[..., None]], dim=-1) / _HELD
         return torch.cat([further(state), constraint[..., None, :]], dim=-2)
 
     found = find_mode(problem, rows, nodes.start, _NODE_ITERATIONS, _NODE_DISTANCE)
-    log_det = 2 * found.here.root.diagonal(dim1=-2, dim2=-1).abs().log().sum(-1)
-    log_weight = nodes.log_weight - (found.here.cost + log_det) / 2
+    log_weight = nodes.log_weight - found.here.cost / 2
     share = _shares(torch.where(torch.isfinite(log_weight), log_weight, -torch.inf))
     lost = torch.where(found.converged, 0.0, share).movedim(0, -1).contiguous().sum(-1)
     columns = torch.cat([found.here.factor, (found.state - mode.state)[..., None]], dim=-1)
@@ -92,25 +93,25 @@ def _shares(log_weight: Tensor) -> Tensor:
 
 
 def turn(state: Float[Tensor, "*batch state"]) -> Float[Tensor, "*batch"]:
-    """φ, rad: the angle of n about the scan line."""
-    n = BoardState.split(state).n
-    return torch.atan2(n[..., 2], n[..., 1])
+    """ψ, rad: the boards' mean rotation about the scan line, from their nominal ones."""
+    return BoardState.split(state).theta[..., 0].mean(-1)
 
 
 def turn_gradient(state: Float[Tensor, "*batch state"]) -> Float[Tensor, "*batch state"]:
-    """Derivative of φ by the state."""
-    n2, n3 = state[..., -2], state[..., -1]
-    by_motion = torch.stack([-n3, n2], dim=-1) / (n2.square() + n3.square())[..., None]
-    return torch.cat([torch.zeros_like(state[..., :-2]), by_motion], dim=-1)
+    """Derivative of ψ by the state."""
+    parts = BoardState.split(torch.zeros_like(state))
+    theta = parts.theta.clone()
+    theta[..., 0] = 1 / theta.shape[-2]
+    return BoardState(theta, parts.position, parts.n).join()
 
 
-def _nodes(mode: Mode) -> _Nodes:
+def _nodes(mode: Mode, count: int) -> _Nodes:
     """Nodes of Gauss-Hermite quadrature about the mode, as wide as its tangent says, on the tangent."""
-    points, weights = (mode.state.new_tensor(values) for values in np.polynomial.hermite_e.hermegauss(_NODES))
+    points, weights = (mode.state.new_tensor(values) for values in np.polynomial.hermite_e.hermegauss(count))
     factor = mode.here.factor
     along = apply(factor.mT.contiguous(), turn_gradient(mode.state))
     sigma = torch.linalg.vector_norm(along, dim=-1)
-    tangent = apply(factor, along) / sigma[..., None].square()  # change of the state by φ
+    tangent = apply(factor, along) / sigma[..., None].square()  # change of the state by ψ
     by_node = (-1, *(1,) * sigma.ndim)
     offset = sigma.clamp(max=_FARTHEST / float(points.max())) * points.reshape(by_node)
     log_weight = weights.log().reshape(by_node) + points.square().reshape(by_node) / 2

@@ -10,7 +10,8 @@ class CornersConfig(Checked):
     """How corners of a scan are accepted.
 
     ``max_line_difference`` (lines) rejects a corner that the two cameras place on different lines: on a rectified rig
-    both see it at the same moment. ``min_corners`` is the fewest that make a board. ``depth_window_mm`` is the side of
+    both see it at the same moment. Lines by which all corners differ, since the cameras are out of step, do not count.
+    ``min_corners`` is the fewest that make a board. ``depth_window_mm`` is the side of
     the patch of a depth map to which a plane is fitted where a scan has no second image.
     """
 

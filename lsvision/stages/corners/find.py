@@ -19,6 +19,7 @@ from lsvision.image.board.refine import DetectedCorners
 from lsvision.image.planes import fit_local_planes
 from lsvision.stages.corners.config import CornersConfig
 from lsvision.stages.corners.pairing import pair_lattices
+from lsvision.stages.corners.rows import RowDifference
 from lsvision.types import Board, BoardCorners, DepthView, LineImage, Scan, StereoPair, Travel
 
 
@@ -90,23 +91,34 @@ def _located(scan: Scan, images: list[LineImage], seen: list[SeenBoard], board: 
 
 
 def _triangulated(scan: Scan, left: DetectedCorners, right: DetectedCorners, config: CornersConfig) -> _Measured:
-    """From the columns of both images and the mean of both lines, weighted by their variance."""
+    """From the columns of both images and the mean of both lines, weighted by their variance.
+
+    Where the cameras are out of step, the lines are those of the left one.
+    """
     valid = left.valid & right.valid
-    valid &= (left.position[:, 1] - right.position[:, 1]).abs() <= config.max_line_difference
+    right_line = right.position[:, 1] - _lines_out_of_step(left, right, valid)
+    valid &= (left.position[:, 1] - right_line).abs() <= config.max_line_difference
     u_left, u_right = left.position[:, 0], right.position[:, 0]
     x, z = triangulate(scan.rig, u_left, u_left - u_right)
     weight = left.covariance[:, 1, 1].reciprocal()
     weight = weight / (weight + right.covariance[:, 1, 1].reciprocal())
-    line = weight * left.position[:, 1] + (1 - weight) * right.position[:, 1]
+    line = weight * left.position[:, 1] + (1 - weight) * right_line
     points = torch.stack([x, travel_at(scan.travel, line), z], dim=-1)
 
     pitch = _pitch_at(scan.travel, line)
     by_columns = triangulation_jacobian(scan.rig, u_left, u_left - u_right)
     by_left = _point_jacobian(by_columns.sum(-1), pitch * weight)
     by_right = _point_jacobian(-by_columns[..., 1], pitch * (1 - weight))
-    covariance = by_left @ left.covariance @ by_left.mT
-    covariance = covariance + by_right @ right.covariance @ by_right.mT
+    covariance = by_left @ left.covariance @ by_left.mT + by_right @ right.covariance @ by_right.mT
+    mixed = by_left @ left.covariance_with(right) @ by_right.mT
+    covariance = covariance + mixed + mixed.mT
     return _Measured(points, covariance, valid & torch.isfinite(points).all(-1), right.position)
+
+
+def _lines_out_of_step(left: DetectedCorners, right: DetectedCorners, seen: Tensor) -> float:
+    """By how many lines most of the corners are later in the right image; 0 where that is no more than noise."""
+    difference = RowDifference.of((right.position - left.position)[seen, 1])
+    return difference.lines if difference.is_systematic else 0.0
 
 
 def _from_depth_map(scan: Scan, left: DetectedCorners, depth: LineImage, config: CornersConfig) -> _Measured:

@@ -17,7 +17,8 @@ from lsvision.types import Depth, DepthSource, DepthView, Rig, Scan, StereoPair,
 class MatchedDepth:
     """The depth of a stereo scan; the last blocks stay in memory, since neighbouring reads overlap.
 
-    The sigma is None where the matcher does not refine: nothing is known about it then.
+    ``known_relation`` of the images is measured where it is not given. The sigma is None where the matcher does not
+    refine: nothing is known about it then.
     """
 
     images: StereoPair
@@ -57,12 +58,21 @@ class MatchedDepth:
     @cached_property
     def relation(self) -> PairRelation:
         """How the right image differs from the left one apart from disparity; measured when it is first needed."""
-        return self.known_relation or relation_of(self.images.left, self.images.right, self.rig, self.config)
+        return self.known_relation or relation_of(self.images, self.rig, self.config)
 
     def _match(self, index: int) -> Depth:
-        match = measure_block(self.images.left, self.images.right, self.rig, self.config, self.relation, index)
+        match = measure_block(self.images, self.relation, self.rig, self.config, index)
         z = depth_at(self.rig, match.disparity)
         return Depth(z, depth_sigma(self.rig, z, match.sigma) if self.config.tells_sigma else None)
+
+
+def relation_of_scan(scan: Scan, config: DisparityConfig) -> PairRelation | None:
+    """How the two images of a scan differ apart from disparity; None for a scan with a depth map."""
+    match scan.images:
+        case StereoPair() as pair:
+            return relation_of(pair, scan.rig, config)
+        case DepthView():
+            return None
 
 
 def depth_of(

@@ -10,13 +10,14 @@ from lsvision.geometry import disparity_at_height
 from lsvision.image.brightness import gray, gray_bytes
 from lsvision.image.stereo.agreement import occluded
 from lsvision.image.stereo.blocks import block_side, enlarged
+from lsvision.image.stereo.clipping import UnusableSamples
 from lsvision.image.stereo.coarse_to_fine import COARSEST, match_coarse_to_fine
 from lsvision.image.stereo.refine import RefineOptions, refine_disparity
 from lsvision.image.stereo.relation import PairRelation, measure_relation
 from lsvision.image.stereo.sgbm import GrayPair, Search, match_sgbm
 from lsvision.image.tiling import HaloRange
 from lsvision.stages.disparity.config import COARSE_TO_FINE_PX, DisparityConfig
-from lsvision.types import LineImage, Rig, TensorImage
+from lsvision.types import LineImage, Rig, StereoPair, TensorImage
 
 _BLANK_TEST_STEP = 9  # every ninth line shows whether a camera saw anything
 
@@ -47,24 +48,24 @@ def measure_strip(left: Tensor, right: Tensor, rig: Rig, config: DisparityConfig
 
     A block in which one of the cameras saw no more than its noise has no match anywhere.
     """
-    pair = TensorImage(left), TensorImage(right)
-    relation = relation_of(*pair, rig, config)
-    count = -(-len(left) // config.block_lines)
-    blocks = [measure_block(*pair, rig, config, relation, index) for index in range(count)]
+    pair = StereoPair(TensorImage(left), TensorImage(right))
+    relation = relation_of(pair, rig, config)
+    blocks = [measure_block(pair, relation, rig, config, index) for index in range(-(-len(left) // config.block_lines))]
     if len(blocks) == 1:
         return blocks[0]
     return StripMatch(torch.cat([block.disparity for block in blocks]), torch.cat([block.sigma for block in blocks]))
 
 
-def relation_of(left: LineImage, right: LineImage, rig: Rig, config: DisparityConfig) -> PairRelation:
-    """How the right image of a scan differs from the left one apart from disparity."""
-    config = config.for_width(left.shape[1])
-    size = COARSEST if left.shape[1] >= COARSE_TO_FINE_PX else 1
-    return measure_relation(left, right, _search_range(rig, config), config.refine_noise, size)
+def relation_of(pair: StereoPair, rig: Rig, config: DisparityConfig) -> PairRelation:
+    """What the codes of a scan's two images mean, and how the right one differs apart from disparity."""
+    width = pair.left.shape[1]
+    config = config.for_width(width)
+    size = COARSEST if width >= COARSE_TO_FINE_PX else 1
+    return measure_relation(pair, _search_range(rig, config), config.refine_noise, size)
 
 
 def measure_block(
-    left: LineImage, right: LineImage, rig: Rig, config: DisparityConfig, relation: PairRelation, index: int
+    pair: StereoPair, relation: PairRelation, rig: Rig, config: DisparityConfig, index: int
 ) -> StripMatch:
     """Disparity and sigma of the lines of one block, of images of any length.
 
@@ -74,16 +75,15 @@ def measure_block(
         relation: of the two images, ``relation_of`` the whole scan.
         index: of the block, which begins at line ``index * config.block_lines``.
     """
-    config = config.for_width(left.shape[1])
-    lines = HaloRange.at(index * config.block_lines, config.block_lines, config.halo_lines or 0, left.shape[0])
-    gray_left = _gray(left.read(lines.outer_start, lines.outer_stop), relation.white)
-    gray_right = _gray(_read_shifted(right, lines, relation.rows.whole), relation.white)
-    if relation.exposure is not None:
-        gray_right = relation.exposure.apply(gray_right)
+    config, shift, levels = config.for_width(pair.left.shape[1]), relation.rows.whole, relation.levels
+    lines = HaloRange.at(index * config.block_lines, config.block_lines, config.halo_lines or 0, pair.left.shape[0])
+    left, right = pair.left.read(lines.outer_start, lines.outer_stop), _read_shifted(pair.right, lines, shift)
+    unusable = UnusableSamples(levels.left.unusable(left), levels.right.unusable(right))
+    gray_left, gray_right = _gray(left, levels.white), relation.as_bright_as_left(_gray(right, levels.white))
     with_gain = relation.exposure is not None or config.matcher == "sgbm"
-    match = _measure(gray_left, gray_right, rig, config, with_gain=with_gain)
-    partner = torch.arange(lines.start, lines.stop) + relation.rows.whole
-    alone = ((partner < 0) | (partner >= right.shape[0]))[:, None]
+    match = _measure(gray_left, gray_right, unusable, rig, config, with_gain=with_gain)
+    partner = torch.arange(lines.start, lines.stop) + shift
+    alone = ((partner < 0) | (partner >= pair.right.shape[0]))[:, None]
     return StripMatch(*(values[lines.inner].masked_fill(alone, torch.nan) for values in (match.disparity, match.sigma)))
 
 
@@ -100,10 +100,12 @@ def _read_shifted(image: LineImage, lines: HaloRange, shift: int) -> Tensor:
 
 def _gray(image: Tensor, white: float) -> Tensor:
     """Brightness on a scale of 0..255, as is the configured noise: bytes of byte images, float32 of others."""
-    return gray_bytes(image) if image.dtype == torch.uint8 else gray(image) * (255.0 / white)
+    return gray_bytes(image) if image.dtype == torch.uint8 and white == 255.0 else gray(image) * (255.0 / white)
 
 
-def _measure(left: Tensor, right: Tensor, rig: Rig, config: DisparityConfig, *, with_gain: bool) -> StripMatch:
+def _measure(
+    left: Tensor, right: Tensor, unusable: UnusableSamples, rig: Rig, config: DisparityConfig, *, with_gain: bool
+) -> StripMatch:
     """Disparity and sigma of a pair of grey images: search, then refinement.
 
     Args:
@@ -111,12 +113,12 @@ def _measure(left: Tensor, right: Tensor, rig: Rig, config: DisparityConfig, *, 
     """
     # In noise alone every pixel would find a match somewhere.
     if any(float(image[::_BLANK_TEST_STEP].float().std()) <= config.refine_noise for image in (left, right)):
-        disparity = torch.full(left.shape, torch.nan)
-    else:
-        disparity = _search(left, right, rig, config)
+        return StripMatch(torch.full(left.shape, torch.nan), torch.full(left.shape, torch.nan))
+    searched = _search(left, right, rig, config)
+    block, (lines, width) = block_side(left, searched), left.shape
+    disparity = unusable.removed_from(searched, block)
     if not config.refine_iterations:
-        lines, width = left.shape
-        disparity = enlarged(disparity, block_side(left, disparity))[:lines, :width]
+        disparity = enlarged(disparity, block)[:lines, :width]
         return StripMatch(disparity, torch.full_like(disparity, torch.nan))
     options = RefineOptions(
         window=config.refine_window,

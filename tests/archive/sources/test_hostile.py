@@ -4,13 +4,15 @@ import os
 import unicodedata
 import zipfile
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
-from lsvision.archive import find_scans, local_archive, read_calibrations
+from lsvision.archive import find_scans, local_archive, plan_one, read_calibrations
 from lsvision.archive.plan import plan_run
 from lsvision.archive.product import product_path
 from lsvision.errors import ConfigError, FileFormatError
+from lsvision.experiments.command_line import in_one_line
 from lsvision.io import scan_sha256
 from lsvision.io.inside import path_inside
 from tests.archive.archives import PROCESSING, make_scan, process
@@ -184,3 +186,23 @@ def test_devices_are_not_hashed(tmp_path):
     (scan / "scan.yaml").write_text(text.replace("left.tif", "../pipe"))
     with pytest.raises(FileFormatError, match="pipe: no such file"):
         scan_sha256(scan)
+
+
+def test_a_name_with_control_characters_is_a_fault_of_its_scan(tmp_path, calibration):
+    make_scan(tmp_path / "line\nbreak\x1b[31m", 40)
+    touch(tmp_path, "a", "dollar $HOME ${x} ", "Käfer")
+    found = find_scans(str(tmp_path))
+    assert [(item.key, item.problem) for item in found if item.problem] == [
+        (r"line\nbreak\x1b[31m", "its name has control characters; rename it")
+    ]
+    with pytest.raises(FileFormatError, match="its name has control characters") as raised:
+        plan_one(tmp_path / "line\nbreak\x1b[31m", calibration, PROCESSING)
+    assert in_one_line(raised.value).isprintable()
+
+
+def test_a_zip_that_no_disk_holds(zipped, tmp_path, monkeypatch):
+    url = zipped(**{"x/a/extra.bin": "0" * 10_000_000})
+    monkeypatch.setattr("shutil.disk_usage", lambda _: SimpleNamespace(free=5_000_000))
+    with pytest.raises(ConfigError, match=r"archive: its copies take 0.0 GB, .* has room for 0.0 GB"):
+        local_archive(url, tmp_path / "copies")
+    assert not (tmp_path / "copies").exists()

@@ -1,61 +1,123 @@
-"""The gain of correlated residuals against a loop over fits, blocks and parameters, and against noise that is known."""
+"""The covariance of corners from correlated noise: against dense matrices, and against noise that is known."""
+
+import math
 
 import pytest
 import torch
 from torch import Tensor
 
-from lsvision.image.board.correlated_noise import correlation_gain
+from lsvision.image.board.correlated_noise import (
+    Correlation,
+    Residuals,
+    corner_covariance,
+    expected_products,
+    nonnegative_solution,
+    possible_covariance,
+)
+from lsvision.image.board.saddle import fit_saddles
+from tests.image.board.conftest import saddle_windows
 
-WANTED = slice(0, 2)
-
-
-def slow_gain(jacobian: Tensor, inverse_normal: Tensor, residual: Tensor, variance: Tensor, block: int) -> Tensor:
-    """Gain of one fit by blocks of ``block x block`` cells, sum by sum; a cell is an eighth of the window."""
-    size = round(len(residual) ** 0.5)
-    cell = max(round(size / 8), 1)
-    cells = -(-size // cell)
-    influence = inverse_normal[WANTED] @ jacobian
-    observed = taken = torch.tensor(0.0).double()
-    for top in range(1 - block, cells):
-        for left in range(1 - block, cells):
-            v, u = torch.meshgrid(torch.arange(size), torch.arange(size), indexing="ij")
-            rows = (v >= top * cell) & (v < (top + block) * cell)
-            here = (rows & (u >= left * cell) & (u < (left + block) * cell)).flatten()
-            for pull in influence:
-                observed = observed + (pull * residual)[here].sum().square()
-                share = (jacobian * pull)[:, here].sum(-1)
-                taken = taken + share @ inverse_normal @ share
-    return observed / (variance * (block**2 * influence.square().sum() - taken))
+SIZE = 7
 
 
-@pytest.mark.parametrize("size", [6, 17, 27])
-def test_equals_a_loop(size):
-    jacobian = torch.randn(3, 5, size**2, dtype=torch.float64)
-    jacobian[:, :, torch.rand(size**2) < 0.2] = 0.0
-    residual = torch.randn(3, size**2, dtype=torch.float64)
+def random_residuals(fits: int = 3) -> Residuals:
+    weight = (torch.rand(fits, SIZE**2) > 0.2).double()
+    jacobian = torch.randn(fits, 4, SIZE**2, dtype=torch.float64) * weight[:, None]
     inverse_normal = torch.linalg.inv(jacobian @ jacobian.mT)
-    variance = residual.square().mean(-1)
-    gain = correlation_gain(jacobian, inverse_normal, WANTED, residual, variance)
-    for i in range(3):
-        fit = jacobian[i], inverse_normal[i], residual[i], variance[i]
-        torch.testing.assert_close(gain[i], 2 * slow_gain(*fit, block=4) - slow_gain(*fit, block=2))
+    residual = torch.randn(fits, SIZE**2, dtype=torch.float64) * weight
+    return Residuals(residual, weight, jacobian, inverse_normal, torch.rand(fits, 2, dtype=torch.float64) - 0.5)
 
 
-def test_independent_noise_has_a_gain_of_one():
-    jacobian = torch.randn(4, 17**2, dtype=torch.float64)
-    inverse_normal = torch.linalg.inv(jacobian @ jacobian.mT)
-    noise = torch.randn(4000, 17**2, dtype=torch.float64)
-    residual = noise - noise @ jacobian.mT @ inverse_normal @ jacobian
-    variance = residual.square().sum(-1) / (17**2 - 4)
-    batch = len(noise)
-    gain = correlation_gain(
-        jacobian.expand(batch, -1, -1), inverse_normal.expand(batch, -1, -1), WANTED, residual, variance
+def dense(first: Residuals, second: Residuals, fit: int) -> Tensor:
+    """Covariance matrices of all kinds of noise between the pixels of two windows, number by number."""
+    axis = torch.arange(SIZE).double()
+    v, u = (x.flatten() for x in torch.meshgrid(axis, axis, indexing="ij"))
+    shift = second.corner[fit] - first.corner[fit]
+    du, dv = u[:, None] - u + shift[0], v[:, None] - v + shift[1]
+    box = (1 - du.abs()).clamp(min=0) * (1 - dv.abs()).clamp(min=0)
+    wide = [torch.exp(-0.5 * (du.square() + dv.square()) / s**2) for s in (1.0, 2.0, 4.0)]
+    edges = first.steepness[fit][:, None] * box * second.steepness[fit]
+    return torch.stack([box, *wide, edges])
+
+
+def left_over(fits: Residuals, fit: int) -> Tensor:
+    jacobian = fits.jacobian[fit]
+    return fits.weight[fit].diag() - jacobian.mT @ fits.inverse_normal[fit] @ jacobian
+
+
+def test_products_equal_those_of_dense_matrices():
+    first, second = random_residuals(), random_residuals()
+    correlation = Correlation.between(first, second, torch.float64)
+    applied = correlation.times(second.influence)
+    expected = torch.zeros(5, 5).double()
+    for fit in range(3):
+        kinds = dense(first, second, fit)
+        torch.testing.assert_close(applied[:, fit].mT, kinds @ second.influence[fit].mT, rtol=0, atol=1e-12)
+        seen = left_over(first, fit) @ kinds @ left_over(second, fit)
+        expected += torch.einsum("kij, lij -> kl", seen, kinds)
+    torch.testing.assert_close(expected_products(first, second, correlation), expected, rtol=0, atol=1e-10)
+    both = Correlation.between(first, first, torch.float64)
+    torch.testing.assert_close(
+        expected_products(first, first, both), expected_products(first, first.of(slice(0, 3)), both)
     )
-    assert abs(gain.mean() - 1) < 0.03
 
 
-def test_residuals_of_zero_have_no_gain():
-    jacobian = torch.randn(1, 4, 81, dtype=torch.float64)
-    inverse_normal = torch.linalg.inv(jacobian @ jacobian.mT)
-    zero = torch.zeros(1, 81).double()
-    assert correlation_gain(jacobian, inverse_normal, WANTED, zero, zero[:, 0]).tolist() == [0.0]
+def test_nonnegative_solution():
+    root = torch.randn(4, 6, dtype=torch.float64)
+    matrix = root @ root.mT
+    inside = torch.tensor([0.5, 1.0, 2.0, 0.1]).double()
+    torch.testing.assert_close(nonnegative_solution(matrix, matrix @ inside), inside)
+    # By hand: the free minimum (2, -1) of a circle lies nearest to (2, 0).
+    circle = nonnegative_solution(torch.eye(2).double(), torch.tensor([2.0, -1.0]).double())
+    assert circle.tolist() == [2.0, 0.0]
+    assert nonnegative_solution(torch.eye(2).double(), -torch.ones(2).double()).tolist() == [0.0, 0.0]
+
+
+def test_a_possible_covariance_is_left_and_an_impossible_one_reduced():
+    first, second = torch.tensor([[2.0, 0.3], [0.3, 1.0]]).double()[None], 4 * torch.eye(2).double()[None]
+    small = torch.tensor([[0.4, 0.1], [-0.2, 0.3]]).double()[None]
+    torch.testing.assert_close(possible_covariance(small, first, second), small)
+    reduced = possible_covariance(30 * small, first, second)
+    whole = torch.cat([torch.cat([first, reduced], -1), torch.cat([reduced.mT, second], -1)], -2)
+    assert torch.linalg.eigvalsh(whole).min() > 0
+
+
+def noisy_fits(count: int, size: int, noise: float, texture: float, width: float):
+    """Fits of pairs of images: a texture that both show, as wide as told, and noise of each."""
+    position = torch.zeros(count, 2).double()
+    angles = torch.tensor([0.3, 0.3 + 1.6]).double().expand(count, 2)
+    clean = saddle_windows(position, angles, torch.ones(count).double())
+    reach = math.ceil(3 * width)
+    axis = torch.arange(-reach, reach + 1).double()
+    kernel = torch.exp(-0.5 * (axis / max(width, 1e-3)).square())
+    kernel = kernel / kernel.square().sum().sqrt()
+    field = torch.randn(count, 1, size + 2 * reach, size + 2 * reach, dtype=torch.float64)
+    field = torch.nn.functional.conv2d(field, kernel.reshape(1, 1, 1, -1))
+    field = torch.nn.functional.conv2d(field, kernel.reshape(1, 1, -1, 1))[:, 0]
+    return [fit_saddles(clean + texture * field + noise * torch.randn_like(clean), angles) for _ in range(2)]
+
+
+@pytest.mark.parametrize(("texture", "width"), [(0.0, 1.0), (6.0, 0.5), (6.0, 1.5), (3.0, 3.0)])
+def test_chi_square_of_the_difference_and_the_mean_of_two_images(texture, width):
+    left, right = noisy_fits(500, 17, 3.0, texture, width)
+    own = [corner_covariance(fit.residuals, fit.residuals) for fit in (left, right)]
+    shared = possible_covariance(corner_covariance(left.residuals, right.residuals), *own)
+    for error, covariance in (
+        (left.position, own[0]),
+        (left.position - right.position, own[0] + own[1] - shared - shared.mT),
+        (left.position + right.position, own[0] + own[1] + shared + shared.mT),
+    ):
+        squared = (error * torch.linalg.solve(covariance, error[..., None])[..., 0]).sum(-1)
+        assert 1.7 < squared.mean() < 2.35
+    if texture == 0:
+        white = left.covariance.diagonal(dim1=-2, dim2=-1).mean()
+        assert abs(own[0].diagonal(dim1=-2, dim2=-1).mean() / white - 1) < 0.05
+        assert shared.diagonal(dim1=-2, dim2=-1).mean().abs() < 0.1 * white
+
+
+def test_windows_of_different_size_are_compared_in_their_middle():
+    left, _ = noisy_fits(20, 17, 3.0, 3.0, 1.5)
+    smaller = left.residuals.cropped(13)
+    assert smaller.size == 13
+    assert torch.equal(smaller.residual[0].reshape(13, 13), left.residuals.residual[0].reshape(17, 17)[2:15, 2:15])
+    assert corner_covariance(left.residuals, smaller).isfinite().all()

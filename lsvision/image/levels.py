@@ -1,0 +1,132 @@
+"""What the codes of a pair of line cameras mean: white, saturation, and columns that are at fault.
+
+All of it is read from a few lines at fixed places, so that every strip of a scan is read alike.
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+import torch.nn.functional as F  # noqa: N812
+from jaxtyping import Bool, Float, Shaped
+from torch import Tensor
+
+from lsvision.image.brightness import gray, sampled_lines, white_level
+from lsvision.types import LineImage, StereoPair
+
+_NO_CODE = 2**32
+_DEPTHS = (10, 12, 14, 16)  # bits of sensors whose images have sixteen
+_HOT_SHARE = 2e-4  # of the samples may lie above a plateau: hot pixels
+_PLATEAU_SHARE, _PLATEAU_RISE, _PLATEAU_BELOW = 1e-3, 2.0, 3  # of the samples; over the most frequent code just below
+_GROUP = 16  # neighbouring columns tell how one of them should vary
+# Of the usual range along the scan, which is 3 codes at least. A column is stuck where both its neighbours are lively:
+# at the rim of a dark stretch ranges change from column to column.
+_STUCK, _LIVELY, _LEAST_RANGE = 0.1, 0.5, 3.0
+_WILD, _LEAST_DIFFERENCE = 8.0, 0.02  # times the usual difference from a neighbour; of white
+
+
+@dataclass(frozen=True)
+class CameraLevels:
+    """Saturation and faults of one line camera.
+
+    Attributes:
+        plateau: from this code on samples are saturated.
+        tops: codes that are saturated by themselves: the largest ones of the sensors that the image may come from.
+        faulty: columns that are stuck at a value, or vary with something else than the object.
+    """
+
+    plateau: int
+    tops: tuple[int, ...]
+    faulty: Bool[Tensor, " width"]
+
+    @classmethod
+    def of(cls, image: LineImage, white: float) -> "CameraLevels":
+        """Read the levels of an image.
+
+        Args:
+            white: the ``white_level`` of the scan.
+        """
+        sampled = sampled_lines(image)
+        faulty = _faulty_columns(sampled, white)
+        if not image.dtype.is_floating_point:
+            codes = sampled[:, ~faulty, _deciding_channel(sampled)].flatten().to(torch.int64)
+            highest = int(codes.kthvalue(max(1, len(codes) - int(_HOT_SHARE * len(codes)))).values) if len(codes) else 0
+            plateau = highest if _is_plateau(codes, highest) else torch.iinfo(image.dtype).max
+            return cls(plateau, _top_codes(image.dtype, codes, highest), faulty)
+        return cls(_NO_CODE, (), faulty)
+
+    def unusable(self, lines: Shaped[Tensor, "lines width channels"]) -> Bool[Tensor, "lines width"] | None:
+        """Which samples are saturated or from a faulty column; None where none is. Green decides for all colours."""
+        codes = cv2.extractChannel(lines.numpy(), _deciding_channel(lines))
+        if codes.max() < min(self.plateau, *self.tops, _NO_CODE) and not bool(self.faulty.any()):
+            return None
+        bad = codes >= min(self.plateau, np.iinfo(codes.dtype).max)
+        for top in self.tops:
+            bad |= codes == top
+        return torch.from_numpy(bad | self.faulty.numpy())
+
+
+@dataclass(frozen=True)
+class PairLevels:
+    """Levels of a scan's two cameras; ``white`` is the value that becomes 255 in both."""
+
+    white: float
+    left: CameraLevels
+    right: CameraLevels
+
+    @classmethod
+    def of(cls, pair: StereoPair) -> "PairLevels":
+        """Read the levels of both images."""
+        white = white_level(pair.left, pair.right)
+        return cls(white, CameraLevels.of(pair.left, white), CameraLevels.of(pair.right, white))
+
+
+def _deciding_channel(values: Shaped[Tensor, "lines width channels"]) -> int:
+    """The channel whose saturation decides: green, of which brightness is mostly made, or the only one."""
+    return min(1, values.shape[-1] - 1)
+
+
+def _is_plateau(codes: Tensor, highest: int) -> bool:
+    """Whether samples pile up at the highest code, as they do where it stands for everything brighter."""
+    counts = torch.stack([(codes == highest - below).sum() for below in range(_PLATEAU_BELOW + 1)])
+    piled, below = float(counts[0]), float(counts[1:].max())
+    return piled >= _PLATEAU_SHARE * len(codes) and piled > _PLATEAU_RISE * below and below > 0
+
+
+def _top_codes(dtype: torch.dtype, codes: Tensor, highest: int) -> tuple[int, ...]:
+    """The largest codes of sensors whose range holds the highest of some codes, right- or left-aligned."""
+    if dtype == torch.uint8:
+        return ()
+    largest = [2**bits - 1 for bits in _DEPTHS] + [(2**bits - 1) << (16 - bits) for bits in _DEPTHS]
+    return tuple(sorted({code for code in largest if code >= highest}))
+
+
+def _faulty_columns(sampled: Float[Tensor, "lines width channels"], white: float) -> Bool[Tensor, " width"]:
+    """Columns that do not vary along the scan although their neighbours do, or differ from both of them far more.
+
+    The median over the sampled lines is what counts: an edge of the object that crosses a column is no fault.
+    """
+    values = gray(sampled)
+    ranges = values.amax(0) - values.amin(0)
+    usual_range = _usual(ranges)
+    stuck = (ranges <= _STUCK * usual_range) & (usual_range >= _LEAST_RANGE) & _between(ranges > _LIVELY * usual_range)
+    steps = F.pad(values.diff(dim=1).abs().median(0).values, (1, 1), value=torch.inf)
+    difference = torch.minimum(steps[:-1], steps[1:])  # from the nearer neighbour
+    wild = (difference > _WILD * _usual(difference, around=True)) & (difference > _LEAST_DIFFERENCE * white)
+    return stuck | wild
+
+
+def _between(marked: Bool[Tensor, " width"]) -> Bool[Tensor, " width"]:
+    """Columns with a marked one, or the line's end, among the two on their left and among the two on their right."""
+    ended = F.pad(marked, (2, 2), value=True)
+    return (ended[:-4] | ended[1:-3]) & (ended[3:-1] | ended[4:])
+
+
+def _usual(values: Float[Tensor, " width"], *, around: bool = False) -> Float[Tensor, " width"]:
+    """Median of the group of neighbouring columns that each belongs to; the largest of three groups ``around`` it."""
+    width = len(values)
+    groups = F.pad(values, (0, -width % _GROUP), value=torch.nan).view(-1, _GROUP).nanmedian(-1).values
+    if around:
+        groups = F.max_pool1d(groups[None], 3, 1, 1)[0]
+    return groups.repeat_interleave(_GROUP)[:width]
