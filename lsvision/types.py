@@ -268,8 +268,9 @@ class Iteration:
 class BoardFit:
     """Pose of one board in the scan frame, and its residuals before and after calibration.
 
-    ``reduced_chi_square`` compares the residuals after with the corners' given covariance: 1 where they are as
-    expected, None where it is not known.
+    ``corners`` is how many were used. ``reduced_chi_square`` compares their residuals after with their given
+    covariance: 1 where they are as expected; ``largest_residual`` is that of one corner, in sigmas; None where they are
+    not known. ``outliers`` are the corners left out, as (column, row) from 1 at the board's origin.
     """
 
     scan: str
@@ -278,6 +279,8 @@ class BoardFit:
     rmse_before_mm: float
     rmse_after_mm: float
     reduced_chi_square: float | None = None
+    outliers: tuple[tuple[int, int], ...] = ()
+    largest_residual: float | None = None
 
 
 @dataclass(frozen=True)
@@ -336,7 +339,8 @@ class Calibration:
 
     The verdict is ``not converged`` where the estimate did not settle; else ``inconsistent`` where the boards
     contradict each other, what was said of them, or the model; else ``prior-dominated`` where they leave a direction of
-    n to the prior; else ``determined``. ``reasons`` are the sentences that say why it is not ``determined``.
+    n to the prior; else ``determined``. ``reasons`` are the sentences that say why it is not ``determined``,
+    ``notes`` what else was noticed and allowed for.
     ``noise_scale`` is how many times larger than the corners' given covariance their residuals are, 1 where they are as
     expected; the covariance of n allows for it, and for the ``errors_along_scan`` that the residuals show.
     """
@@ -351,6 +355,7 @@ class Calibration:
     rig: Rig
     verdict: Verdict = "determined"
     reasons: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
     converged: bool = True
     noise_scale: float = 1.0
     errors_along_scan: tuple[ErrorAlongScan, ...] = ()

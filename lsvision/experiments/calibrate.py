@@ -99,6 +99,7 @@ def _summary(calibration: Calibration) -> dict:
         "boards": len(calibration.boards),
         "verdict": calibration.verdict,
         "reasons": list(calibration.reasons),
+        "notes": list(calibration.notes),
         "noise_scale": calibration.noise_scale,
         "errors_along_scan": [asdict(error) for error in calibration.errors_along_scan],
         "n": calibration.motion.n.tolist(),

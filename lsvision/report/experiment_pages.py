@@ -90,10 +90,15 @@ def _motion_headlines(calibration: Calibration) -> list[Headline]:
 
 
 def _explained(calibration: Calibration) -> list[str]:
-    """The reasons for the verdict, the errors that it allows for, and the advice where it is not one of them."""
+    """The reasons for the verdict, what was noticed and allowed for, and the advice where it is not one of them."""
     advice = calibration.observability.advice
     allowed_for = [error.in_words for error in calibration.errors_along_scan]
-    return [*calibration.reasons, *allowed_for, *([] if advice in calibration.reasons else [advice])]
+    return [
+        *calibration.reasons,
+        *calibration.notes,
+        *allowed_for,
+        *([] if advice in calibration.reasons else [advice]),
+    ]
 
 
 def product_report(

@@ -23,6 +23,7 @@ def calibration_summary(calibration: Calibration) -> str:
     ]
     lines += [f"  allowed for  {error.in_words}" for error in calibration.errors_along_scan]
     lines += [f"  because      {reason}" for reason in calibration.reasons if reason != observability.advice]
+    lines += [f"  note         {note}" for note in calibration.notes]
     unknown = [direction for direction in observability.directions if not direction.observed]
     lines += [
         f"  not measured {_vector(direction.vector, '+.2f')}: σ stays at {direction.posterior_sigma:.1e} "

@@ -73,17 +73,14 @@ class BoardEntries(Checked):
     rmse_before_mm: NonNegative
     rmse_after_mm: NonNegative
     reduced_chi_square: NonNegative | None = None
+    outliers: tuple[tuple[int, int], ...] = ()
+    largest_residual: NonNegative | None = None
 
     def fit(self) -> BoardFit:
         """The board's fit."""
-        return BoardFit(
-            scan=self.scan,
-            corners=self.corners,
-            pose=Pose(_float64(self.rotation), _float64(self.translation_mm)),
-            rmse_before_mm=self.rmse_before_mm,
-            rmse_after_mm=self.rmse_after_mm,
-            reduced_chi_square=self.reduced_chi_square,
-        )
+        pose = Pose(_float64(self.rotation), _float64(self.translation_mm))
+        rest = {item.name: getattr(self, item.name) for item in fields(BoardFit) if item.name != "pose"}
+        return BoardFit(pose=pose, **rest)
 
 
 @dataclass(frozen=True)
@@ -131,6 +128,7 @@ class CalibrationEntries(Checked):
     provenance: ProvenanceEntries
     verdict: Verdict | None = None
     reasons: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
     noise_scale: Positive = 1.0
     errors_along_scan: tuple[ErrorAlongScan, ...] = ()
     converged: bool | None = None
@@ -149,6 +147,7 @@ def write_calibration(calibration: Calibration, path: Path | str) -> None:
         "method": calibration.method,
         "verdict": calibration.verdict,
         "reasons": list(calibration.reasons),
+        "notes": list(calibration.notes),
         "converged": calibration.converged,
         "noise_scale": calibration.noise_scale,
         "errors_along_scan": [asdict(item) for item in calibration.errors_along_scan],
@@ -186,6 +185,7 @@ def read_calibration(path: Path | str) -> Calibration:
         method=entries.method,
         verdict=entries.verdict or _verdict_of_earlier_file(converged, observability),
         reasons=entries.reasons,
+        notes=entries.notes,
         converged=converged,
         noise_scale=entries.noise_scale,
         errors_along_scan=entries.errors_along_scan,
@@ -230,15 +230,12 @@ def _motion_to_dict(motion: Motion) -> dict[str, object]:
 
 
 def _board_to_dict(board: BoardFit) -> dict[str, object]:
-    return {
-        "scan": board.scan,
-        "corners": board.corners,
+    rest = {item.name: getattr(board, item.name) for item in fields(board) if item.name != "pose"}
+    pose = {
         "rotation": board.pose.rotation.double().tolist(),
         "translation_mm": board.pose.translation.double().tolist(),
-        "rmse_before_mm": board.rmse_before_mm,
-        "rmse_after_mm": board.rmse_after_mm,
-        "reduced_chi_square": board.reduced_chi_square,
     }
+    return {"scan": board.scan, "corners": board.corners, **pose, **rest}
 
 
 def _verdict_of_earlier_file(converged: bool, observability: Observability) -> Verdict:

@@ -3,57 +3,33 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from lsvision.errors import CalibrationError, ConfigError
 from lsvision.estimation import Info, Posterior
 from lsvision.geometry import sharp_depth_mm
+from lsvision.stages.calibration.batch import BatchCalibration, errors_along_scan_of, iterations_of
 from lsvision.stages.calibration.config import CalibrationConfig
 from lsvision.stages.calibration.correlated import ErrorsAlongScan
 from lsvision.stages.calibration.exchanged import images_exchanged
+from lsvision.stages.calibration.findings import find_flaws
+from lsvision.stages.calibration.hypotheses import Assumed
 from lsvision.stages.calibration.measurements import BoardMeasurements, SoundProblem
+from lsvision.stages.calibration.misplaced import column_rows, largest_residuals
 from lsvision.stages.calibration.model import refitted, rotations, squared_residuals, translations
 from lsvision.stages.calibration.noise import board_chi_square
 from lsvision.stages.calibration.observability import Known, observe
+from lsvision.stages.calibration.outliers import outlying
 from lsvision.stages.calibration.problem import BoardProblem, MountingPitch
+from lsvision.stages.calibration.scatter import widened
 from lsvision.stages.calibration.solution import estimate_with_noise
 from lsvision.stages.calibration.verdict import judge, not_settled, rmse_grew
-from lsvision.types import BoardCorners, BoardFit, Calibration, ErrorAlongScan, Iteration, Motion, Pose, Rig
-
-# Errors along the scan below this part of the largest are not mentioned, though allowed for.
-_FAINT = 0.1
+from lsvision.types import BoardCorners, BoardFit, Calibration, Motion, Pose, Rig
 
 __all__ = ["BatchCalibration", "CalibrationConfig", "calibrate", "calibrate_batch"]
-
-
-@dataclass(frozen=True)
-class BatchCalibration:
-    """Calibrations of a batch of problems; a problem whose ``info`` is SINGULAR holds NaN.
-
-    ``noise_scale`` is the factor on the given covariance that the residuals asked for, 1 where they are as expected;
-    ``along_scan_rms_mm`` and ``along_scan_length_mm`` are of the errors of x, travel and z that are correlated along
-    the scan, zero where none were found; covariances include both. ``rmse_path_mm`` and ``n_path`` run by iteration
-    from the state before (index 0), and repeat the result past a problem's last iteration.
-    """
-
-    n: Float[Tensor, "*batch 3"]
-    covariance: Float[Tensor, "*batch 3 3"]
-    rotation: Float[Tensor, "*batch boards 3 3"]
-    translation_mm: Float[Tensor, "*batch boards 3"]
-    rmse_path_mm: Float[Tensor, "iterations *batch"]
-    n_path: Float[Tensor, "iterations *batch 3"]
-    board_rmse_before_mm: Float[Tensor, "*batch boards"]
-    board_rmse_after_mm: Float[Tensor, "*batch boards"]
-    noise_scale: Float[Tensor, "*batch"]
-    along_scan_rms_mm: Float[Tensor, "*batch 3"]
-    along_scan_length_mm: Float[Tensor, "*batch 3"]
-    iterations: Int[Tensor, "*batch"]
-    converged: Bool[Tensor, "*batch"]
-    info: Int[Tensor, "*batch"]
 
 
 def calibrate(boards: Sequence[BoardCorners], rig: Rig, config: CalibrationConfig) -> Calibration:
@@ -84,10 +60,13 @@ def calibrate(boards: Sequence[BoardCorners], rig: Rig, config: CalibrationConfi
     depth_mm = config.depth_range_mm or sharp_depth_mm(rig)
     known = Known(batch.covariance, config.prior_sigma, scale, depth_mm)
     observability = observe(solution.weighed, solution.posterior.mean, known)
-    iterations, converged = _iterations(batch), bool(batch.converged)
+    iterations, converged = iterations_of(batch), bool(batch.converged)
     before_mm, after_mm = iterations[0].rmse_mm, iterations[-1].rmse_mm
-    contradictions = rmse_grew(before_mm, after_mm)
-    if scale > 1 or bool((batch.along_scan_rms_mm > 0).any()):  # where the residuals are no noise as stated
+    assumed = Assumed(config.prior_sigma, config.board_scale_sigma)
+    findings = find_flaws(boards, solution.problem, solution.start, solution.outlying, assumed)
+    along_scan = errors_along_scan_of(batch)
+    contradictions = [*findings.contradictions, *rmse_grew(before_mm, after_mm)]
+    if scale > 1 or along_scan:  # where the residuals are no noise as stated
         contradictions = images_exchanged(boards, rig, config, after_mm) or contradictions
     judged = judge(not_settled(converged, int(batch.iterations)), contradictions, observability)
     return Calibration(
@@ -96,14 +75,15 @@ def calibrate(boards: Sequence[BoardCorners], rig: Rig, config: CalibrationConfi
         rmse_before_mm=before_mm,
         rmse_after_mm=after_mm,
         iterations=iterations,
-        boards=_board_fits(boards, batch, board_chi_square(solution.problem, solution.posterior.mean)),
+        boards=_board_fits(boards, batch, solution),
         observability=observability,
         rig=rig,
         verdict=judged.verdict,
         reasons=judged.reasons,
+        notes=findings.notes if along_scan else (*findings.notes, *findings.shake),
         converged=converged,
         noise_scale=scale,
-        errors_along_scan=_errors_along_scan(batch),
+        errors_along_scan=along_scan,
     )
 
 
@@ -131,15 +111,20 @@ def calibrate_batch(
 
 @dataclass(frozen=True)
 class _Solution:
-    """Problems of a batch with their posteriors; these have the noise scaled, the problems as it was given.
+    """Problems of a batch, without outlying corners, and their posteriors.
 
-    ``along_scan`` are the errors that the posteriors allow for besides.
+    The posteriors have the noise scaled and allow for the errors ``along_scan``; the problems have it as given.
+    ``scatter`` is that between the boards.
     """
 
     problem: BoardProblem
+    start: Float[Tensor, "*batch state"]
+    outlying: Bool[Tensor, "*batch boards corners"]
     posterior: Posterior
     noise_scale: Float[Tensor, "*batch"]
+    scatter: Float[Tensor, "*batch"]
     along_scan: ErrorsAlongScan
+    prior_sigma: float
 
     @property
     def weighed(self) -> BoardProblem:
@@ -155,9 +140,12 @@ class _Solution:
         squared, corners = self._squared_residuals(path), problem.valid.sum(-1)
         board_rmse = (squared / corners).sqrt()
         motion_factor = torch.where(singular[..., None, None], torch.nan, posterior.factor[..., -3:, :])
+        covariance = motion_factor @ motion_factor.mT
+        if bool((self.scatter > 1).any()):
+            covariance = widened(covariance, self.scatter, self.prior_sigma)
         return BatchCalibration(
             n=state[..., -3:],
-            covariance=motion_factor @ motion_factor.mT,
+            covariance=covariance,
             rotation=rotations(problem, state),
             translation_mm=translations(problem, state),
             rmse_path_mm=(squared.sum(-1) / corners.sum(-1)).sqrt(),
@@ -182,13 +170,25 @@ class _Solution:
 
 
 def _solve(measured: BoardMeasurements, config: CalibrationConfig) -> _Solution:
-    """The problems estimated, once more where their residuals ask for a larger noise or are correlated."""
+    """The problems estimated without outlying corners, and with the noise that the others' residuals ask for."""
     config = config.resolved()
     _check(config, measured.points.shape[-3])
     posed = SoundProblem.of(measured, _mounting_pitch(config))
+    off = outlying(posed.problem)
+    if bool(off.any()):
+        posed = SoundProblem.of(replace(measured, valid=measured.valid & ~off), _mounting_pitch(config))
     found = estimate_with_noise(posed.problem, posed.start, config)
     info = torch.where(posed.sound, found.posterior.info, int(Info.SINGULAR))
-    return _Solution(posed.problem, replace(found.posterior, info=info), found.noise_scale, found.along_scan)
+    return _Solution(
+        posed.problem,
+        posed.start,
+        off,
+        replace(found.posterior, info=info),
+        found.noise_scale,
+        found.scatter,
+        found.along_scan,
+        config.prior_sigma,
+    )
 
 
 def _check(config: CalibrationConfig, boards: int) -> None:
@@ -203,34 +203,19 @@ def _mounting_pitch(config: CalibrationConfig) -> MountingPitch | None:
     return MountingPitch(math.radians(config.mounting_pitch_deg), math.radians(config.mounting_pitch_sigma_deg))
 
 
-def _iterations(batch: BatchCalibration) -> tuple[Iteration, ...]:
-    stretch = torch.linalg.vector_norm(batch.n_path, dim=-1)
-    return tuple(
-        Iteration(rmse_mm, (n1, n2, n3), length)
-        for rmse_mm, (n1, n2, n3), length in zip(
-            batch.rmse_path_mm.tolist(), batch.n_path.tolist(), stretch.tolist(), strict=True
-        )
-    )
-
-
-def _errors_along_scan(batch: BatchCalibration) -> tuple[ErrorAlongScan, ...]:
-    """Those of one problem that are not much smaller than the largest."""
-    rms, length = batch.along_scan_rms_mm.tolist(), batch.along_scan_length_mm.tolist()
-    components: tuple[Literal["x", "travel", "z"], ...] = ("x", "travel", "z")
-    return tuple(
-        ErrorAlongScan(*error) for error in zip(components, rms, length, strict=True) if error[1] > _FAINT * max(rms)
-    )
-
-
-def _board_fits(boards: Sequence[BoardCorners], batch: BatchCalibration, chi_square: Tensor) -> tuple[BoardFit, ...]:
+def _board_fits(boards: Sequence[BoardCorners], batch: BatchCalibration, solution: _Solution) -> tuple[BoardFit, ...]:
+    problem, state = solution.problem, solution.posterior.mean
+    chi_square, largest = board_chi_square(problem, state), largest_residuals(problem, state)
     return tuple(
         BoardFit(
             scan=board.scan,
-            corners=int(board.valid.sum()),
+            corners=int(problem.valid[i].sum()),
             pose=Pose(batch.rotation[i], batch.translation_mm[i]),
             rmse_before_mm=float(batch.board_rmse_before_mm[i]),
             rmse_after_mm=float(batch.board_rmse_after_mm[i]),
             reduced_chi_square=float(chi_square[i]),
+            outliers=column_rows(board.board_points, solution.outlying[i, : len(board.valid)]),
+            largest_residual=largest[i],
         )
         for i, board in enumerate(boards)
     )

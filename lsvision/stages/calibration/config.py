@@ -34,6 +34,7 @@ class CalibrationConfig(Checked):
     prior_sigma: Positive = 0.05  # of each component of n about (0, 1, 0); finite, as few boards determine all of n
     rotation_sigma_rad: PositiveOrInfinite = math.inf
     translation_sigma_mm: PositiveOrInfinite = math.inf
+    board_scale_sigma: NonNegative = 0.0  # of the board's relative size, print and temperature; 0 takes it as exact
     max_iterations: PositiveInt = 20
     tolerance: NonNegative = 1e-6  # Kullback-Leibler divergence between two iterates, nats
     two_step_threshold_mm: NonNegative = 0.0  # RMSE at or below which Alg. 1 ends

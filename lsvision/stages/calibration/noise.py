@@ -15,10 +15,17 @@ from lsvision.stages.calibration.sequential import filtered
 _NOISE_TEST_LEVEL = 1e-3
 
 
-def noise_scale(problem: BoardProblem, state: Float[Tensor, "*batch state"]) -> Float[Tensor, "*batch"]:
-    """Reduced chi-square of the residuals where they are larger than chance allows, else 1."""
-    freedom = 3.0 * problem.valid.sum((-2, -1)) - state.shape[-1]
-    return _beyond_chance(_squared_residuals(problem, state).sum(-1), freedom)
+def noise_scale(
+    problem: BoardProblem, squared: Float[Tensor, "*batch boards"], explained: Float[Tensor, "*batch"]
+) -> Float[Tensor, "*batch"]:
+    """Reduced chi-square of the residuals where they are larger than chance allows, else 1.
+
+    Args:
+        squared: residuals of each board, see ``squared_residuals_of_boards``.
+        explained: part of the squared residuals that is known not to be noise, in sigmas.
+    """
+    freedom = 3.0 * problem.valid.sum((-2, -1)) - (6 * problem.boards + 3)
+    return _beyond_chance((squared.sum(-1) - explained).clamp(min=0), freedom)
 
 
 def drifting_noise_scale(
@@ -40,7 +47,7 @@ def board_chi_square(problem: BoardProblem, state: Float[Tensor, "*batch state"]
     The unknowns are shared out: the six of its own pose to each board, an equal part of n to all.
     """
     freedom = 3.0 * problem.valid.sum(-1) - 6.0 - 3.0 / problem.boards
-    return _squared_residuals(problem, state) / freedom
+    return squared_residuals_of_boards(problem, state) / freedom
 
 
 def _beyond_chance(squared: Tensor, freedom: Tensor) -> Tensor:
@@ -48,8 +55,10 @@ def _beyond_chance(squared: Tensor, freedom: Tensor) -> Tensor:
     return torch.where(unlikely, squared / freedom, 1.0)
 
 
-def _squared_residuals(problem: BoardProblem, state: Tensor) -> Tensor:
-    """Sums over the corners of each board, ``(*batch, boards)``."""
+def squared_residuals_of_boards(
+    problem: BoardProblem, state: Float[Tensor, "*batch state"]
+) -> Float[Tensor, "*batch boards"]:
+    """Squared residuals in sigmas of the given noise, summed over the corners of each board."""
     corners_alone = problem if problem.pitch is None else replace(problem, pitch=None)
     rows = linearise(corners_alone, state, point_factor(state)).matrix[..., -1]
     return rows.unflatten(-1, (problem.boards, -1)).square().sum(-1)

@@ -43,11 +43,25 @@ def affine_rows(
     Args:
         noise_chol: Cholesky factor of the covariance of ``points``, mm.
     """
-    parts = (noise_chol, points, body_points, valid)
+    return feature_rows(noise_chol, points, torch.cat([torch.ones_like(body_points[..., :1]), body_points], -1), valid)
+
+
+def feature_rows(
+    noise_chol: Float[Tensor, "*batch boards corners 3 3"],
+    points: Float[Tensor, "*batch boards corners 3"],
+    features: Float[Tensor, "*batch boards corners features"],
+    valid: Bool[Tensor, "*batch boards corners"],
+) -> Float[Tensor, "*batch boards rows rows"]:
+    """Whitened rows ``[S | q]`` on a map to measured points that is linear in features of a corner.
+
+    For the map's coefficients c, three of each feature in turn, ‖q - S c‖² is the squared whitened error of all valid
+    corners; the last row, in which S is zero, is the error that no coefficients remove.
+    """
+    parts = (noise_chol, points, features, valid)
     if valid.ndim < 3:
-        return _affine_rows(*parts)
+        return _feature_rows(*parts)
     step = max(1, _BOARDS_IN_CACHE // points.shape[-3])
-    return torch.cat([_affine_rows(*pieces) for pieces in zip(*(part.split(step) for part in parts), strict=True)])
+    return torch.cat([_feature_rows(*pieces) for pieces in zip(*(part.split(step) for part in parts), strict=True)])
 
 
 def rows_with_latents(
@@ -85,17 +99,18 @@ def residual_rows(
     return upper_root(torch.where(valid[..., None], rows, 0.0))
 
 
-def _affine_rows(noise_chol: Tensor, points: Tensor, body_points: Tensor, valid: Tensor) -> Tensor:
+def _feature_rows(noise_chol: Tensor, points: Tensor, features: Tensor, valid: Tensor) -> Tensor:
     eye = torch.eye(3, dtype=points.dtype, device=points.device)
     eye = eye.reshape(3, 3, *(1,) * valid.ndim).expand(3, 3, *valid.shape)
     right = torch.cat([eye, points.movedim(-1, 0)[:, None]], dim=1)
     whitened = forward_substitute(noise_chol.movedim((-2, -1), (0, 1)), right)
     # Whitener and whitened points as (*batch, boards, column, row, corner): corners side by side in memory.
     whitened = torch.where(valid, whitened, 0.0).movedim((1, 0), (-3, -2))
-    columns = points.new_empty(*whitened.shape[:-3], 13, *whitened.shape[-2:])
-    columns[..., :3, :, :], columns[..., 12, :, :] = whitened[..., :3, :, :], whitened[..., 3, :, :]
-    for k, component in enumerate(body_points.unbind(-1)):
-        by_point = columns[..., 3 + 3 * k : 6 + 3 * k, :, :]
-        torch.mul(whitened[..., :3, :, :], component[..., None, None, :], out=by_point)
+    count = features.shape[-1]
+    columns = points.new_empty(*whitened.shape[:-3], 3 * count + 1, *whitened.shape[-2:])
+    columns[..., 3 * count, :, :] = whitened[..., 3, :, :]
+    for k, feature in enumerate(features.unbind(-1)):
+        by_feature = columns[..., 3 * k : 3 * k + 3, :, :]
+        torch.mul(whitened[..., :3, :, :], feature[..., None, None, :], out=by_feature)
     # In one layout whatever comes before: the order of sums, and so their last bits, follows it.
     return upper_root(columns.flatten(-2).mT).contiguous()

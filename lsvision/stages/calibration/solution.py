@@ -1,33 +1,40 @@
 """Posteriors of a batch of problems, with the noise that their residuals ask for: as given, larger, or correlated."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from lsvision.estimation import Posterior
+from lsvision.stages.calibration.board_scale import explained_by_size, with_unknown_size
 from lsvision.stages.calibration.chosen import merged, scattered
 from lsvision.stages.calibration.config import CalibrationConfig
 from lsvision.stages.calibration.correlated import Beforehand, ErrorsAlongScan, errors_along_scan, suspicious
 from lsvision.stages.calibration.methods import estimate
 from lsvision.stages.calibration.model import residuals_in_sigmas
-from lsvision.stages.calibration.noise import drifting_noise_scale, noise_scale
+from lsvision.stages.calibration.noise import drifting_noise_scale, noise_scale, squared_residuals_of_boards
 from lsvision.stages.calibration.problem import BoardProblem
+from lsvision.stages.calibration.scatter import scatter
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """Posteriors of a batch of problems, their noise multiplied by ``noise_scale``, 1 where it is as given."""
+    """Posteriors of a batch of problems, their noise multiplied by ``noise_scale``, 1 where it is as given.
+
+    ``scatter`` is that between the boards, see ``scatter``; the posteriors do not allow for it.
+    """
 
     posterior: Posterior
     noise_scale: Float[Tensor, "*batch"]
+    scatter: Float[Tensor, "*batch"]
 
     def replaced(self, chosen: Bool[Tensor, "*batch"], part: "Estimate") -> "Estimate":
         """The same with the chosen problems' replaced by those of ``part``, in a row."""
         scale = scattered(chosen, part.noise_scale, self.noise_scale)
-        return Estimate(merged(chosen, part.posterior, self.posterior), scale)
+        apart = scattered(chosen, part.scatter, self.scatter)
+        return Estimate(merged(chosen, part.posterior, self.posterior), scale, apart)
 
 
 @dataclass(frozen=True)
@@ -50,7 +57,11 @@ def estimate_with_noise(
     if bool(along.found.any()):
         again = estimate_white(along.problem(problem), start[along.found], config)
         found = found.replaced(along.found, again)
-    return NoisyEstimate(found.posterior, found.noise_scale, along)
+    weighed = replace(problem, correlated=along.noise)
+    posterior = found.posterior
+    if not _drifts(weighed, config):
+        posterior = with_unknown_size(weighed, posterior, found.noise_scale, config.board_scale_sigma)
+    return NoisyEstimate(posterior, found.noise_scale, found.scatter, along)
 
 
 def estimate_white(problem: BoardProblem, start: Float[Tensor, "*batch state"], config: CalibrationConfig) -> Estimate:
@@ -58,13 +69,17 @@ def estimate_white(problem: BoardProblem, start: Float[Tensor, "*batch state"], 
     posterior = estimate(problem, start, config)
     if _drifts(problem, config):
         scale = drifting_noise_scale(problem, start, posterior.mean, config)
+        apart = torch.ones_like(scale)
     else:
-        scale = noise_scale(problem, posterior.mean)
-    found, larger = Estimate(posterior, scale), scale > 1
+        squared = squared_residuals_of_boards(problem, posterior.mean)
+        explained = explained_by_size(problem, posterior, config.board_scale_sigma)
+        scale = noise_scale(problem, squared, explained)
+        apart = scatter(problem, (squared.sum(-1) - explained) / scale, posterior, scale, config.prior_sigma)
+    found, larger = Estimate(posterior, scale, apart), scale > 1
     if not bool(larger.any()):
         return found
     again = estimate(problem.scaled(scale).at(larger), start[larger], config)
-    return found.replaced(larger, Estimate(again, scale[larger]))
+    return found.replaced(larger, Estimate(again, scale[larger], apart[larger]))
 
 
 def _drifts(problem: BoardProblem, config: CalibrationConfig) -> bool:

@@ -51,6 +51,7 @@ def test_file_has_the_documented_keys(tmp_path: Path, calibration: Calibration) 
             "method",
             "verdict",
             "reasons",
+            "notes",
             "converged",
             "noise_scale",
             "errors_along_scan",
@@ -68,7 +69,8 @@ def test_file_has_the_documented_keys(tmp_path: Path, calibration: Calibration) 
     assert data["improvement"] == pytest.approx(1 - 0.8794 / 2.059)
     assert list(data["iterations"][0]) == ["rmse_mm", "n", "stretch"]
     assert list(data["boards"][0]) == [
-        *("scan", "corners", "rotation", "translation_mm", "rmse_before_mm", "rmse_after_mm", "reduced_chi_square")
+        *("scan", "corners", "rotation", "translation_mm", "rmse_before_mm", "rmse_after_mm"),
+        *("reduced_chi_square", "outliers", "largest_residual"),
     ]
     assert list(data["observability"]) == ["verdict", "directions", "advice"]
     assert list(data["observability"]["directions"][0]) == ["vector", "prior_sigma", "posterior_sigma", "observed"]

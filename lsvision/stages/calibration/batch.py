@@ -1,0 +1,59 @@
+"""The result of calibrating a batch of problems."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from lsvision.types import ErrorAlongScan, Iteration
+
+# Errors along the scan below this part of the largest are not mentioned, though allowed for.
+_FAINT = 0.1
+
+
+@dataclass(frozen=True)
+class BatchCalibration:
+    """Calibrations of a batch of problems; a problem whose ``info`` is SINGULAR holds NaN.
+
+    ``noise_scale`` is the factor on the given covariance that the residuals asked for, 1 where they are as expected;
+    ``along_scan_rms_mm`` and ``along_scan_length_mm`` are of the errors of x, travel and z that are correlated along
+    the scan, zero where none were found; covariances include both. ``rmse_path_mm`` and ``n_path`` run by iteration
+    from the state before (index 0), and repeat the result past a problem's last iteration.
+    """
+
+    n: Float[Tensor, "*batch 3"]
+    covariance: Float[Tensor, "*batch 3 3"]
+    rotation: Float[Tensor, "*batch boards 3 3"]
+    translation_mm: Float[Tensor, "*batch boards 3"]
+    rmse_path_mm: Float[Tensor, "iterations *batch"]
+    n_path: Float[Tensor, "iterations *batch 3"]
+    board_rmse_before_mm: Float[Tensor, "*batch boards"]
+    board_rmse_after_mm: Float[Tensor, "*batch boards"]
+    noise_scale: Float[Tensor, "*batch"]
+    along_scan_rms_mm: Float[Tensor, "*batch 3"]
+    along_scan_length_mm: Float[Tensor, "*batch 3"]
+    iterations: Int[Tensor, "*batch"]
+    converged: Bool[Tensor, "*batch"]
+    info: Int[Tensor, "*batch"]
+
+
+def iterations_of(batch: BatchCalibration) -> tuple[Iteration, ...]:
+    """The iterations of one problem."""
+    stretch = torch.linalg.vector_norm(batch.n_path, dim=-1)
+    return tuple(
+        Iteration(rmse_mm, (n1, n2, n3), length)
+        for rmse_mm, (n1, n2, n3), length in zip(
+            batch.rmse_path_mm.tolist(), batch.n_path.tolist(), stretch.tolist(), strict=True
+        )
+    )
+
+
+def errors_along_scan_of(batch: BatchCalibration) -> tuple[ErrorAlongScan, ...]:
+    """Those of one problem that are not much smaller than the largest."""
+    rms, length = batch.along_scan_rms_mm.tolist(), batch.along_scan_length_mm.tolist()
+    components: tuple[Literal["x", "travel", "z"], ...] = ("x", "travel", "z")
+    return tuple(
+        ErrorAlongScan(*error) for error in zip(components, rms, length, strict=True) if error[1] > _FAINT * max(rms)
+    )
