@@ -7,7 +7,8 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from lsvision.image.board.correlated_noise import Residuals, corner_covariance, possible_covariance
-from lsvision.image.board.saddle import SaddleFit, SaddleOptions, fit_saddles
+from lsvision.image.board.outliers import evenly_clipped, in_line_with_neighbours, like_the_board
+from lsvision.image.board.saddle import SaddleOptions, fit_saddles
 from lsvision.image.brightness import gray
 from lsvision.types import LineImage
 
@@ -15,8 +16,6 @@ _READ_LINES = 512
 _MODEL_PX = 0.001  # a pixel's box is no Gaussian: the error that a sharp image without noise or texture leaves
 _INTO_SQUARES = 0.4  # share of a square that a window takes in: blur and shift stay clear of the next edges
 _FEWEST_PIXELS = 49  # of the squares in a window
-# How far the fit of a window may be from the board's median: a corner under glare, smear or dirt is another picture.
-_WORST_RESIDUAL, _WORST_BLUR, _LEAST_CONTRAST = 3.0, 2.0, 0.3
 
 
 @dataclass(frozen=True)
@@ -93,10 +92,12 @@ def refine_grid(
     centre = grid.reshape(-1, 2).round().long()
     inside = lies_within(image, centre, radius)
     windows = read_windows(image, centre, inside, radius)
-    fit = fit_saddles(
-        windows, steps.normal_angles().to(windows), steps.within_squares(radius), SaddleOptions(plain=plain)
-    )
-    valid = _like_the_board(fit, fit.valid & inside)
+    mask = steps.within_squares(radius)
+    fit = fit_saddles(windows, steps.normal_angles().to(windows), mask, SaddleOptions(plain=plain))
+    valid = like_the_board(fit, fit.valid & inside)
+    if not plain:
+        valid = evenly_clipped(windows, mask, valid)
+        valid = in_line_with_neighbours((centre + fit.position).reshape(grid.shape), valid)
     covariance = torch.full_like(fit.covariance, torch.nan)
     if plain:
         covariance[valid] = fit.covariance[valid]
@@ -130,15 +131,3 @@ def read_windows(
         columns = (centre[here, 0, None] + span)[:, None, :]
         windows[here] = gray(strip[rows, columns]).to(torch.float64)
     return windows
-
-
-def _like_the_board(fit: SaddleFit, valid: Tensor) -> Tensor:
-    """Valid corners whose windows look like those of the rest of the board: smear, glare and dirt do not."""
-    relative = fit.residual / fit.contrast
-    valid = valid & (relative < _WORST_RESIDUAL * _median(relative, valid))
-    valid = valid & (fit.blur_px < _WORST_BLUR * _median(fit.blur_px, valid))
-    return valid & (fit.contrast > _LEAST_CONTRAST * _median(fit.contrast, valid))
-
-
-def _median(values: Tensor, valid: Tensor) -> Tensor:
-    return torch.where(valid, values, torch.nan).nanmedian()

@@ -1,0 +1,95 @@
+"""Corners that are not to be trusted: under glare, shadow, smear or dirt, clipped, or behind something on the board."""
+
+import torch
+import torch.nn.functional as F  # noqa: N812
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from lsvision.image.board.lattice import QuadraticMap
+from lsvision.image.board.saddle import SaddleFit
+
+# How far the fit of a window may be from the board's median: a corner under glare, smear or dirt is another picture.
+_WORST_BLUR, _LEAST_CONTRAST = 2.0, 0.3
+# Residuals of sound windows are within 1.2 of their median, those of photographs with windows of few pixels within 1.6.
+_LEAST_RESIDUAL_EXCESS, _EXCESS_SPREADS = 0.35, 6.0
+_CLIPPED_LEVEL = 0.998  # of the largest number that the pixels can have
+_CLIPPED_APART = 0.15  # share of a window's pixels, from the board's median: white squares with a bright rim are sound
+_OUT_OF_LINE_SPREADS, _OUT_OF_LINE_PX = 12.0, 0.5  # perspective and lenses bend rows at the rim
+_FEWEST_IN_LINE = 12
+_NORMAL = 1.4826  # standard deviation of a normal distribution over its median absolute deviation
+
+
+def like_the_board(fit: SaddleFit, valid: Bool[Tensor, " corners"]) -> Bool[Tensor, " corners"]:
+    """Valid corners whose windows look like those of the rest of the board.
+
+    Noise of a sensor does not grow with the light and that of a surface does: a residual is too large where it is so
+    in grey values and in shares of the contrast.
+    """
+    valid = valid & (fit.blur_px < _WORST_BLUR * _median(fit.blur_px, valid))
+    valid = valid & (fit.contrast > _LEAST_CONTRAST * _median(fit.contrast, valid))
+    relative = fit.residual / fit.contrast
+    excess = torch.minimum(fit.residual / _median(fit.residual, valid), relative / _median(relative, valid)) - 1
+    spread = _NORMAL * _median(excess.abs(), valid)
+    return valid & (excess <= (_EXCESS_SPREADS * spread).clamp(min=_LEAST_RESIDUAL_EXCESS))
+
+
+def evenly_clipped(
+    windows: Float[Tensor, "corners size size"],
+    mask: Bool[Tensor, "corners size size"],
+    valid: Bool[Tensor, " corners"],
+) -> Bool[Tensor, " corners"]:
+    """Valid corners whose windows have no more pixels at the end of the sensor's range than the board's median.
+
+    Where white squares are clipped evenly the corners stay where they are; at the rim of glare they move.
+    """
+    brightest = float(windows[valid].max()) if bool(valid.any()) else 0.0
+    end = 2 ** max(8, int(brightest).bit_length()) - 1
+    share = (mask & (windows >= _CLIPPED_LEVEL * end)).sum((1, 2)) / mask.sum((1, 2))
+    return valid & ((share <= _CLIPPED_APART) | ((share - _median(share, valid)).abs() <= _CLIPPED_APART))
+
+
+def in_line_with_neighbours(
+    grid: Float[Tensor, "rows columns 2"], valid: Bool[Tensor, " corners"]
+) -> Bool[Tensor, " corners"]:
+    """Valid corners that lie where their neighbours on the board expect them.
+
+    Each is compared with the median of what pairs of neighbours say, on both of its sides or on one. What is too far
+    follows from the board itself: under vibration all corners are out of line.
+    """
+    if int(valid.sum()) < _FEWEST_IN_LINE:
+        return valid
+    seen = valid.reshape(grid.shape[:2])
+    node = torch.stack(torch.meshgrid(*(torch.arange(n).to(grid) for n in grid.shape[:2]), indexing="ij"), dim=-1)
+    bent = grid - QuadraticMap.fitted(node[seen], grid[seen])(node)
+    bent = torch.where(seen[..., None], bent, torch.nan)
+    apart = (bent - _expected(bent)).reshape(-1, 2).abs()
+    spread = _NORMAL * apart.nanmedian(0).values
+    limit = _OUT_OF_LINE_SPREADS * torch.where(torch.isfinite(spread), spread, torch.inf) + _OUT_OF_LINE_PX
+    return valid & ~(apart > limit).any(-1)
+
+
+def _expected(bent: Tensor) -> Tensor:
+    """Median of what the neighbours along both axes say of each place; NaN where it is between none of them.
+
+    A corner of the board itself could only be extrapolated: uneven travel would look like an error.
+    """
+    padded = F.pad(bent, (0, 0, 2, 2, 2, 2), value=torch.nan)
+    rows, columns = bent.shape[:2]
+
+    def beside(down: int, right: int) -> Tensor:
+        return padded[2 + down : 2 + down + rows, 2 + right : 2 + right + columns]
+
+    said = []
+    for down, right in ((0, 1), (1, 0)):
+        before, after = beside(-down, -right), beside(down, right)
+        said += [
+            (before + after) / 2,
+            2 * before - beside(-2 * down, -2 * right),
+            2 * after - beside(2 * down, 2 * right),
+        ]
+    between = said[0].isfinite() | said[3].isfinite()
+    return torch.where(between, torch.stack(said).nanmedian(0).values, torch.nan)
+
+
+def _median(values: Tensor, valid: Tensor) -> Tensor:
+    return torch.where(valid, values, torch.nan).nanmedian()
