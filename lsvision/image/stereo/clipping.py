@@ -9,6 +9,8 @@ from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 from torch import Tensor
 
+from lsvision.image.stereo.windows import window_sum
+
 _SLOPE_REACH = 1  # columns from a sample of the left image to those whose slope reads it
 _CUBIC_REACH = 2  # columns from a position in the right image to the samples that its value is read from
 
@@ -42,6 +44,22 @@ class UnusableSamples:
             disparity = disparity.clone()
             disparity[rows] = part.masked_fill(spoilt[rows].gather(1, partner), torch.nan)
         return disparity
+
+
+def holes_factor(
+    searched: Float[Tensor, "rows columns"], kept: Float[Tensor, "rows columns"], size: int
+) -> Float[Tensor, "rows columns"]:
+    """By how many times the variance of a disparity grows where its window has lost blocks.
+
+    The smaller the rest of a window, the less of the search's errors a step averages away.
+
+    Args:
+        searched, kept: disparity before and after blocks were removed.
+        size: side of the windows, blocks.
+    """
+    lost = (kept.isnan() & ~searched.isnan()).float()
+    share = window_sum(lost, size).div_(size**2).clamp_(max=0.9)
+    return share.neg_().add_(1.0).pow_(-2)
 
 
 def _rows_of_blocks(unusable: Bool[Tensor, "lines width"], block: int) -> NDArray[np.uint8]:

@@ -22,6 +22,7 @@ from torch import Tensor
 from lsvision.image.stereo.blocks import block_side, enlarged, repeated, whole_blocks
 from lsvision.image.stereo.scatter import SigmaGains, with_scatter
 from lsvision.image.stereo.shift import Certainty, LeftWindows, explained_share
+from lsvision.image.stereo.texture import TextureSupport, texture_support
 from lsvision.image.stereo.warp import warp_cubic
 from lsvision.image.stereo.windows import Windows
 from lsvision.image.tiling import HaloRange, halo_ranges, in_parallel
@@ -49,6 +50,8 @@ class RefineOptions:
             dropped: ground without texture gives little information, but a wrong match gives wrong information.
         with_gain: brightness may differ by a factor, too, not by an offset only.
         with_sigma: False leaves sigma unknown, which saves time, and ``largest_sigma_px`` without effect.
+        texture_confidence: a pixel is dropped unless the texture around it exceeds noise by as many standard
+            deviations, and its sigma covers what texture aside of it leaves open; None does neither.
     """
 
     window: int
@@ -59,6 +62,7 @@ class RefineOptions:
     largest_misfit_px: float = math.inf
     with_gain: bool = False
     with_sigma: bool = True
+    texture_confidence: float | None = None
 
     @property
     def judges(self) -> bool:
@@ -72,10 +76,14 @@ class RefineOptions:
 
 @dataclass(frozen=True)
 class RefinedDisparity:
-    """Disparity and its sigma, px; NaN where there is none."""
+    """Disparity and its sigma, px, and the variance of the grey values that it leaves around each block.
+
+    NaN where there is none.
+    """
 
     disparity: Float[Tensor, "lines width"]
     sigma: Float[Tensor, "lines width"]
+    residual_variance: Float[Tensor, "rows columns"]
 
 
 def refine_disparity(
@@ -117,7 +125,9 @@ def refine_disparity(
     reach = options.iterations + (1 if options.with_sigma else 0)
     halo = 2 * reach * (window // 2) + block - 1  # interpolation reads one block further
     gains = SigmaGains.of(window, options.iterations)
-    result = RefinedDisparity(disparity.new_empty(lines, width), disparity.new_empty(lines, width))
+    result = RefinedDisparity(
+        disparity.new_empty(lines, width), disparity.new_empty(lines, width), torch.full_like(disparity, torch.nan)
+    )
 
     def refine_rows(rows: HaloRange) -> None:
         """Refine a row of tiles."""
@@ -136,13 +146,15 @@ def refine_disparity(
 class _Refined:
     """Disparity of the blocks of a tile, how certain the last step was, and the windows that it used.
 
-    ``explained`` is the share of the left image's variance that the match explains. None is what nobody asks for.
+    ``explained`` is the share of the left image's variance that the match explains, ``support`` what texture proves.
+    None is what nobody asks for.
     """
 
     disparity: Tensor
     certainty: Certainty | None
     windows: Windows
     explained: Tensor | None
+    support: TextureSupport | None
 
 
 def _refine_blocks(left: Tensor, right: Tensor, start: Tensor, first_column: int, options: RefineOptions) -> _Refined:
@@ -165,7 +177,10 @@ def _refine_blocks(left: Tensor, right: Tensor, start: Tensor, first_column: int
     explained = None
     if certainty is not None and options.with_sigma and options.largest_sigma_px < math.inf:
         explained = explained_share(left, windows, certainty.residual_variance, options.noise)
-    return _Refined(disparity, certainty, windows, explained)
+    support = None
+    if certainty is not None and options.texture_confidence is not None:
+        support = texture_support(equations, certainty.residual_variance, options.texture_confidence)
+    return _Refined(disparity, certainty, windows, explained, support)
 
 
 def _smoothed(disparity: Tensor, windows: Windows) -> Tensor:
@@ -185,7 +200,8 @@ def _accepted(refined: _Refined, start: Tensor, gains: SigmaGains, options: Refi
     """Disparity of blocks whose too large changes are undone, NaN where it is too uncertain, and its sigma."""
     disparity = start + _zero_beyond(refined.disparity - start, options.largest_change_px)
     if refined.certainty is None:
-        return RefinedDisparity(disparity, torch.full_like(disparity, torch.nan))
+        unknown = torch.full_like(disparity, torch.nan)
+        return RefinedDisparity(disparity, unknown, unknown)
     sigma = refined.certainty.sigma * gains.iterations
     noisy = refined.certainty.residual_variance > _NOISE_RESIDUAL * options.noise**2
     dropped = (sigma > options.largest_misfit_px).logical_and_(noisy)
@@ -193,7 +209,11 @@ def _accepted(refined: _Refined, start: Tensor, gains: SigmaGains, options: Refi
         sigma = with_scatter(sigma, disparity, refined.windows, gains)
     if refined.explained is not None:
         dropped.logical_or_(sigma > (_EXPLAINED * refined.explained).add_(1.0).mul_(options.largest_sigma_px))
-    return RefinedDisparity(disparity.masked_fill_(dropped, torch.nan), sigma)
+    if refined.support is not None:
+        dropped.logical_or_(~refined.support.proven)
+        sigma = sigma.square_().add_(refined.support.variance).sqrt_()
+    disparity.masked_fill_(dropped, torch.nan)
+    return RefinedDisparity(disparity, sigma, refined.certainty.residual_variance + (disparity - disparity))
 
 
 def _write_pixels(
@@ -208,3 +228,5 @@ def _write_pixels(
     )
     disparity.copy_(enlarged(blocks.disparity, block)[inner])
     torch.add(disparity - disparity, repeated(blocks.sigma, block)[inner], out=sigma)  # NaN where the disparity is
+    own = tuple(slice(part.start, part.stop) for part in ranges)
+    result.residual_variance[own] = blocks.residual_variance[tuple(part.inner for part in ranges)]

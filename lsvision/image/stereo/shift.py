@@ -19,7 +19,7 @@ from lsvision.image.stereo.windows import Windows
 _ROUNDING = 1.0 / 6.0  # variance of the difference of two whole grey values
 # Variance of half the difference of two neighbours over that of the residual: half of a pixel's noise variance, over
 # that of one pixel and of another which interpolation has smoothed to 0.6 of it on average.
-_SLOPE_NOISE = 0.5 / 1.6
+SLOPE_NOISE = 0.5 / 1.6
 _GAIN_SIGMA = 0.3  # of the factor between the brightnesses of two images, as far as it is known beforehand
 
 
@@ -116,7 +116,7 @@ class LeftWindows:
         pixels = self.windows.count * self.block**2
         variance.mul_(pixels).div_((pixels - 2).clamp_(min=1)).clamp_(min=_ROUNDING)
         # The noise of the slope looks like texture but carries no information.
-        known = fit.texture.sub(variance, alpha=_SLOPE_NOISE).clamp_(min=0).add_(self.prior)
+        known = fit.texture.sub(variance, alpha=SLOPE_NOISE).clamp_(min=0).add_(self.prior)
         normal = fit.texture.add(self.prior).clamp_(min=0)
         return Certainty(normal.mul_(variance).div_(pixels).sqrt_().div_(known), variance)
 

@@ -54,7 +54,9 @@ class DisparityConfig(Checked):
     of a pixel of ``sgbm``, which lean towards whole ones. A pixel whose sigma then exceeds ``largest_sigma_px`` is
     dropped where its match explains none of the grey values around it, and where it exceeds 7.25 times as much however
     much its match explains, with limits between for shares between: how often a disparity is wrong depends on both. Of
-    the pixels kept on rendered rails 1 in 1800 is wrong by more than a pixel. Infinity keeps all.
+    the pixels kept on rendered rails 1 in 1800 is wrong by more than a pixel. Infinity keeps all. A pixel is dropped,
+    too, unless the slopes of the grey values around it exceed those of noise by ``texture_confidence`` standard
+    deviations: in noise alone every pixel finds a match.
     ``block_lines`` are matched as one, with ``halo_lines`` beyond either end that are thrown away: blocks lie at
     multiples of their size in the scan, so that a line's disparity depends on nothing else. Workers take
     ``strip_lines`` at once, rounded up to whole blocks.
@@ -73,6 +75,7 @@ class DisparityConfig(Checked):
     refine_window: OddIntFrom3 = 9
     refine_noise: Positive = 2.0  # grey values, of 255
     largest_sigma_px: PositiveOrInfinite | None = None
+    texture_confidence: NonNegative = 4.0
     block_lines: PositiveInt = 1024
     halo_lines: NonNegativeInt | None = None
     strip_lines: PositiveInt = 1024

@@ -9,12 +9,14 @@ from torch import Tensor
 from lsvision.geometry import disparity_at_height
 from lsvision.image.brightness import gray, gray_bytes
 from lsvision.image.stereo.agreement import occluded
-from lsvision.image.stereo.blocks import block_side, enlarged
-from lsvision.image.stereo.clipping import UnusableSamples
+from lsvision.image.stereo.blocks import block_side, enlarged, repeated
+from lsvision.image.stereo.clipping import UnusableSamples, holes_factor
 from lsvision.image.stereo.coarse_to_fine import COARSEST, match_coarse_to_fine
 from lsvision.image.stereo.refine import RefineOptions, refine_disparity
 from lsvision.image.stereo.relation import PairRelation, measure_relation
+from lsvision.image.stereo.residuals import Misfit
 from lsvision.image.stereo.sgbm import GrayPair, Search, match_sgbm
+from lsvision.image.stereo.steps import step_beside
 from lsvision.image.tiling import HaloRange
 from lsvision.stages.disparity.config import COARSE_TO_FINE_PX, DisparityConfig
 from lsvision.types import LineImage, Rig, StereoPair, TensorImage
@@ -128,9 +130,17 @@ def _measure(
         noise=config.refine_noise,
         largest_sigma_px=config.largest_sigma_px or math.inf,
         with_gain=with_gain,
+        texture_confidence=config.texture_confidence,
     )
     refined = refine_disparity(left, right, disparity, options)
-    return StripMatch(refined.disparity, refined.sigma)
+    misfit = Misfit.of(refined.residual_variance, block)
+    factor = misfit.factor
+    if disparity is not searched:
+        factor = factor * holes_factor(searched, disparity, options.window_blocks(block))
+    # A place beside a step may belong to either side. All pixels of a block have one sigma.
+    sides = step_beside(searched, misfit.share, block).mul_(0.5)
+    growth = sides.div_(refined.sigma[::block, ::block]).square_().add_(factor).sqrt_()
+    return StripMatch(refined.disparity, refined.sigma.mul_(repeated(growth, block)[:lines, :width]))
 
 
 def _search(left: Tensor, right: Tensor, rig: Rig, config: DisparityConfig) -> Tensor:

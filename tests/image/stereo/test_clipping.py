@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from lsvision.image.stereo.clipping import UnusableSamples
+from lsvision.image.stereo.clipping import UnusableSamples, holes_factor
 
 LINES, WIDTH = 7, 21
 
@@ -63,3 +63,14 @@ def test_no_block_that_is_left_reads_an_unusable_sample(block):
 def test_nothing_changes_where_every_sample_is_usable():
     disparity = torch.rand(LINES, WIDTH)
     assert UnusableSamples(None, None).removed_from(disparity, 1) is disparity
+
+
+def test_variance_grows_with_what_a_window_has_lost():
+    searched = torch.zeros(20, 20)
+    searched[0, 0] = torch.nan  # never had a match
+    kept = searched.clone()
+    kept[8:13, 8:10] = torch.nan
+    factor = holes_factor(searched, kept, 5)
+    assert factor[10, 8] == pytest.approx((1 - 10 / 25) ** -2)
+    assert factor[10, 11] == pytest.approx((1 - 5 / 25) ** -2)
+    assert factor[2, 2] == 1

@@ -1,0 +1,45 @@
+"""Residuals of a match that are more than noise: of another surface, a highlight, or other light than elsewhere."""
+
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F  # noqa: N812
+from jaxtyping import Float
+from torch import Tensor
+
+_TILE, _STEP = 64, 8  # px, of which every eighth along either side tells the noise
+_ENOUGH = 0.5  # of a tile must have a match to tell its noise
+_DISTURBED = 24.0  # times the usual variance
+
+
+@dataclass(frozen=True)
+class Misfit:
+    """How far residuals exceed noise.
+
+    Attributes:
+        share: variance of the residuals over the usual one, in the map or in the surroundings, whichever is larger.
+        factor: by which the variance of a disparity grows, 1 at least: residuals this large are no independent noise.
+    """
+
+    share: Float[Tensor, "rows columns"]
+    factor: Float[Tensor, "rows columns"]
+
+    @classmethod
+    def of(cls, variance: Float[Tensor, "rows columns"], block: int) -> "Misfit":
+        """That of the residuals around each block of ``block`` pixels a side, NaN where there is no match."""
+        sampled = variance[:: _STEP // block, :: _STEP // block]
+        usual = sampled.nanmedian()
+        around = torch.fmax(_tile_medians(sampled), usual)
+        side = _TILE // block
+        around = around.repeat_interleave(side, 0)[: len(variance)].repeat_interleave(side, 1)[:, : variance.shape[1]]
+        return cls(variance / around, variance.div(_DISTURBED * usual).clamp_(min=1.0))
+
+
+def _tile_medians(sampled: Float[Tensor, "rows columns"]) -> Float[Tensor, "tile_rows tile_columns"]:
+    """Median over each tile, NaN where less than half of it has a match."""
+    side = _TILE // _STEP
+    padded = F.pad(sampled, (0, -sampled.shape[1] % side, 0, -sampled.shape[0] % side), value=torch.nan)
+    rows, columns = (size // side for size in padded.shape)
+    tiles = padded.view(rows, side, columns, side).transpose(1, 2).reshape(rows, columns, side * side)
+    enough = tiles.isnan().float().mean(-1) <= 1.0 - _ENOUGH
+    return torch.where(enough, tiles.nanmedian(-1).values, torch.nan)
