@@ -57,10 +57,9 @@ class LocalEngine:
     ) -> None:
         for pool in [*self._idle, *(pool for _, pool in self._busy.values())]:
             # What is in progress is not waited for where the run is ended: a piece that is lost does no harm.
-            processes = list((pool._processes or {}).values())
-            pool.shutdown(wait=kind is None, cancel_futures=True)
-            for process in processes if kind is not None else ():
+            for process in list((pool._processes or {}).values()) if kind is not None else ():
                 process.terminate()
+            pool.shutdown(cancel_futures=True)
 
     @property
     def capacity(self) -> int:
@@ -150,6 +149,7 @@ def _forget_stdin() -> None:
 def _enter_worker() -> None:
     """Workers end with the run, however that ends, and leave Ctrl-C to it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))  # ends a task, and then the worker, which tidies up
     threading.Thread(target=_end_with_parent, daemon=True).start()
 
 
