@@ -151,9 +151,8 @@ def convergence(iterations: polars.DataFrame, points: polars.DataFrame, others: 
     figure.legend(loc="outside lower center", ncols=2, fontsize=8)
     caption = (
         "The joint estimate reaches the floor set by the noise of the corners within two iterations. A method that "
-        "alternates between poses and n leaves about a third after each iteration on one board (the legend gives the "
-        "mean share removed in the first eight); on several, the error of n3 then goes on falling by less than a "
-        "hundredth in each."
+        "alternates between poses and n leaves about a third after each iteration on one board; on several, the error "
+        "of n3 then falls by less than a hundredth in each. The legend has the mean share removed in the first eight."
     )
     return ReportFigure(
         "convergence", "How fast the methods converge", caption + omitted_curves(points, others), figure

@@ -17,7 +17,7 @@ _RADII = (1.6, 2.6, 3.6, 5.0, 7.0, 10.0, 15.0, 25.0, 40.0)  # squares around the
 _OFF_GRID = 0.25  # squares
 _ALIGNED = 0.3
 _CURVED = 24  # saddles that are enough for a quadratic map
-_EVEN = (0.65, 1.6)  # of the median corner
+_EVEN = (0.65, 1.5)  # of another corner; corners of photographs are within (0.8, 1.25) of their median
 
 
 @dataclass(frozen=True)
@@ -110,16 +110,53 @@ def find_saddle_lattice(brightness: Float[Tensor, "lines width"], corners: int) 
     if not lattices:
         return None
     lattice = max(lattices, key=lambda lattice: lattice.count)
-    # Where squares end at the board's rim three quadrants are white, which is a third as even as a corner of four
-    # squares; saddles of noise and of fine texture are more even than any.
-    share = saddles.evenness / saddles.evenness[lattice.on_grid].median()
-    corner = lattice.on_grid & (share > _EVEN[0]) & (share < _EVEN[1])
-    return SeenLattice(lattice.node[corner].long(), saddles.points[corner])
+    corner = lattice.on_grid & _as_even(saddles, saddles.evenness[lattice.on_grid].median())
+    node = lattice.node[corner].long()
+    patch = patches(node)
+    linked = patch == patch.mode().values if len(patch) else corner[corner]
+    return SeenLattice(node[linked], saddles.points[corner][linked])
+
+
+def patches(node: Int[Tensor, "corners 2"]) -> Int[Tensor, " corners"]:
+    """A number for each node, the same for all that are linked by steps from a node to one of its four neighbours."""
+    linked = (node[:, None] - node[None]).abs().sum(-1) <= 1
+    patch = torch.arange(len(node))
+    while len(node):
+        smallest = torch.where(linked, patch, len(node)).amin(-1)
+        if torch.equal(smallest, patch):
+            break
+        patch = smallest
+    return patch
+
+
+def _as_even(saddles: SaddlePoints, evenness: Tensor) -> Tensor:
+    """Saddles that are about as even as one.
+
+    Where squares end at the board's rim three quadrants are white, which is a third as even as a corner of four
+    squares; saddles of noise and of fine texture are more even than any.
+    """
+    share = saddles.evenness / evenness
+    return (share > _EVEN[0]) & (share < _EVEN[1])
+
+
+def largest_patch(node: Int[Tensor, "corners 2"]) -> Bool[Tensor, " corners"]:
+    """Nodes of the largest patch that is linked by steps from a node to one of its four neighbours."""
+    if not len(node):
+        return torch.zeros(0, dtype=torch.bool)
+    apart = (node[:, None] - node[None]).abs().sum(-1)
+    patch = torch.arange(len(node))
+    while True:
+        # Every patch takes the smallest number in it; of two saddles on one node both belong to it.
+        smallest = torch.where(apart <= 1, patch, len(node)).amin(-1)
+        if torch.equal(smallest, patch):
+            return patch == patch.mode().values
+        patch = smallest
 
 
 def grow_lattice(saddles: SaddlePoints, seed: int) -> Lattice | None:
     """The lattice around one saddle, fitted to the saddles of ever wider surroundings; None where there is none."""
-    offset, alignment = saddles.points - saddles.points[seed], saddles.alignment(seed)
+    offset = saddles.points - saddles.points[seed]
+    alignment = saddles.alignment(seed)
     steps = _first_steps(offset, alignment)
     if steps is None:
         return None
@@ -128,7 +165,7 @@ def grow_lattice(saddles: SaddlePoints, seed: int) -> Lattice | None:
     to_node = QuadraticMap.linear(torch.linalg.inv(steps) * scale)
     for radius in _RADII:
         position = to_node(scaled)
-        lattice = _nodes_within(position, alignment, radius)
+        lattice = _linked_to(seed, _nodes_within(position, alignment, radius))
         if lattice.count < 3:
             return None
         terms, used = 6 if lattice.count >= _CURVED else 3, lattice.on_grid
@@ -155,3 +192,13 @@ def _nodes_within(position: Tensor, alignment: Tensor, radius: float) -> Lattice
     on_grid = ((position - node).abs() < _OFF_GRID).all(-1)
     on_grid &= torch.where(even, alignment, -alignment) > _ALIGNED
     return Lattice(node, on_grid & (position.abs() <= radius).all(-1))
+
+
+def _linked_to(seed: int, lattice: Lattice) -> Lattice:
+    """The lattice without saddles that happen to lie on it apart from the seed's patch, as those of a background do."""
+    if not lattice.on_grid[seed]:
+        return lattice
+    patch = patches(lattice.node[lattice.on_grid].long())
+    on_grid = lattice.on_grid.clone()
+    on_grid[lattice.on_grid] = patch == patch[int(lattice.on_grid[:seed].sum())]
+    return Lattice(lattice.node, on_grid)

@@ -14,7 +14,6 @@
 The remaining fractions of a pixel are the task of ``refine_disparity`` at full size.
 """
 
-import math
 from dataclasses import dataclass, replace
 
 import cv2
@@ -83,13 +82,7 @@ def _reduced(pair: GrayPair, size: int) -> GrayPair:
 
 def _search_quarter(quarter: GrayPair, search: Search, noise: float) -> Tensor:
     """Refined disparity over the whole range at a quarter of the size."""
-    coarse_search = replace(
-        search,
-        minimum_px=math.floor(search.minimum_px / COARSEST),
-        maximum_px=math.ceil(search.maximum_px / COARSEST),
-        left_right_check_px=round(search.left_right_check_px / COARSEST),
-        speckle_px=_COARSE_SPECKLE * search.speckle_px,
-    )
+    coarse_search = replace(search.reduced(COARSEST), speckle_px=_COARSE_SPECKLE * search.speckle_px)
     options = RefineOptions(_QUARTER_WINDOW, iterations=1, noise=noise, with_sigma=False)
     return refine_disparity(quarter.left, quarter.right, match_sgbm(quarter, coarse_search), options).disparity
 

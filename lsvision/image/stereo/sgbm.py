@@ -1,6 +1,7 @@
 """Dense stereo matching of rectified strips by semi-global matching."""
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 
 import cv2
 import torch
@@ -57,6 +58,15 @@ class Search:
             speckleWindowSize=self.speckle_px,
             speckleRange=1,
             mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY,
+        )
+
+    def reduced(self, size: int) -> "Search":
+        """The same range on images that are ``size`` times smaller."""
+        return replace(
+            self,
+            minimum_px=math.floor(self.minimum_px / size),
+            maximum_px=math.ceil(self.maximum_px / size),
+            left_right_check_px=round(self.left_right_check_px / size),
         )
 
     def contains(self, disparity: Float[Tensor, "*shape"]) -> Tensor:

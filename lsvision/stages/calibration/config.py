@@ -25,9 +25,9 @@ class CalibrationConfig(Checked):
     is the maximum of the posterior by Levenberg-Marquardt, the reference that the filter is compared with. The poses'
     prior lies around the poses that fit best under n = (0, 1, 0); infinite sigmas make it flat, so that no corner
     counts twice. ``two_step`` ends where the RMSE is at most ``two_step_threshold_mm``, or changes by no more than the
-    share ``two_step_tolerance`` in an iteration. An option that is None takes the value of the method. Errors that are
-    correlated along the scan, as of vibration or of the encoder, are allowed for where they make the corners
-    ``correlated_odds`` times as probable.
+    share ``two_step_tolerance`` in an iteration. Errors that are correlated along the scan, as of vibration or of the
+    encoder, are allowed for where they make the corners ``correlated_odds`` times as probable. An option that is None
+    takes the value of the method.
     """
 
     method: CalibrationMethod = "joint"
@@ -41,8 +41,8 @@ class CalibrationConfig(Checked):
     two_step_tolerance: NonNegative = 1e-4  # relative change of the RMSE in an iteration at which Alg. 1 ends
     two_step_max_iterations: PositiveInt = 20
     process_sigma: NonNegative | None = None  # of the random walk of n per square root of a mm; sequential only
-    correlated_odds: PositiveOrInfinite = 50.0  # evidence from which errors along the scan are modelled; .inf: never
     depth_range_mm: Positive | None = None  # sharp depth, which proposed boards keep to; None: the rig's usual
+    correlated_odds: PositiveOrInfinite = 50.0  # evidence from which errors along the scan are modelled; .inf: never
     mounting_pitch_deg: AcuteAngle | None = None  # known angle of a single board's normal about the sensor axis
     mounting_pitch_sigma_deg: Positive = 0.1
 

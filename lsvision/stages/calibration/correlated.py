@@ -47,7 +47,7 @@ class ErrorsAlongScan:
 
     def problem(self, problem: BoardProblem) -> BoardProblem:
         """Those of the problems in which errors were found, in a row, with their noise."""
-        return replace(problem, correlated=self.noise).chosen(self.found)
+        return replace(problem, correlated=self.noise).at(self.found)
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,7 @@ def errors_along_scan(
     rows, log_det = problem.affine_rows.clone(), problem.noise_log_det.clone()
     for index in doubtful.nonzero():
         place = tuple(index.tolist())
-        one = problem.chosen(place)
+        one = problem.at(place)
         search = _Search.of(one, state[place], known)
         covariance = search.covariance(math.log(known.odds))
         if covariance is None:

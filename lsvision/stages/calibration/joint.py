@@ -8,6 +8,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from lsvision.estimation import Gaussian, Info, Posterior, Prior, iterated_update, lower_factor
+from lsvision.stages.calibration.chosen import merged
 from lsvision.stages.calibration.config import CalibrationConfig
 from lsvision.stages.calibration.linearise import linearise, point_factor
 from lsvision.stages.calibration.mode import Mode, find_mode, gauss_newton_step, rows_of
@@ -50,7 +51,7 @@ def posterior_from(
     if not bool(doubtful.any()):
         return found
     chosen = Prior(prior.mean[doubtful], prior.root.expand(*begin.shape, -1)[doubtful])
-    return _put(doubtful, _by_mode(problem.chosen(doubtful), chosen, begin[doubtful], config), found)
+    return merged(doubtful, _by_mode(problem.at(doubtful), chosen, begin[doubtful], config), found)
 
 
 def mode_of(
@@ -82,7 +83,7 @@ def covering(
     if bool(curved.any()):
         chosen = Prior(prior.mean[curved], prior.root.expand(*prior.mean.shape, -1)[curved])
         begin = result.mean[curved]
-        by_all = posterior_from(problem.chosen(curved), chosen, begin, config)
+        by_all = posterior_from(problem.at(curved), chosen, begin, config)
         factor[curved] = lower_factor(torch.cat([moved_to(begin, by_all), walk[curved]], dim=-1))
         found[curved] = by_all.converged
     return Covering(factor, found)
@@ -110,23 +111,3 @@ def _by_mode(problem: BoardProblem, prior: Prior, begin: Tensor, config: Calibra
     path = torch.cat([mode.path[:-1], state[None]])
     info = torch.where(spread.found, int(Info.OK), int(Info.NOT_CONVERGED))
     return Posterior(state, factor, path, mode.iterations, spread.found, info)
-
-
-def _put(mask: Bool[Tensor, "*batch"], chosen: Posterior, found: Posterior) -> Posterior:
-    """A batch with the posteriors of the chosen problems in their places."""
-    length = max(len(chosen.path), len(found.path))
-
-    def longer(path: Tensor) -> Tensor:
-        """A path that repeats its end."""
-        return torch.cat([path, path[-1:].expand(length - len(path), *path.shape[1:])])
-
-    def placed(values: Tensor, others: Tensor) -> Tensor:
-        """Values of the chosen problems among those of the others."""
-        out = others.clone()
-        out[mask] = values
-        return out
-
-    path = longer(found.path).movedim(0, -1)
-    fields = ("mean", "factor", "iterations", "converged", "info")
-    merged = {name: placed(getattr(chosen, name), getattr(found, name)) for name in fields}
-    return replace(found, path=placed(longer(chosen.path).movedim(0, -1), path).movedim(-1, 0), **merged)

@@ -65,6 +65,15 @@ class BoardProblem:
         """Number of boards, B; the state has 6 B + 3 components."""
         return self.points.shape[-3]
 
+    def at(self, place: tuple[int, ...] | Bool[Tensor, "*batch"]) -> "BoardProblem":
+        """One problem of a batch by its indices, or those of a mask in a row."""
+        names = ("points", "noise_chol", "body_points", "centroid", "valid", "rotation")
+        correlated = None if self.correlated is None else self.correlated.at(place)
+        problem = replace(self, correlated=correlated, **{name: getattr(self, name)[place] for name in names})
+        if "affine_rows" in self.__dict__:  # the dear one is not computed again
+            problem.__dict__["affine_rows"] = self.affine_rows[place]
+        return problem
+
     def scaled(self, noise_scale: Float[Tensor, "*batch"]) -> "BoardProblem":
         """The problem with the covariance of the corners' noise multiplied by a factor."""
         sigma, correlated = noise_scale.sqrt()[..., None, None, None], self.correlated
@@ -76,15 +85,6 @@ class BoardProblem:
     def rotation_at(self, theta: Float[Tensor, "*#batch boards 3"]) -> Float[Tensor, "*batch boards 3 3"]:
         """Rotations exp(θ) R0 of the boards."""
         return rotation_from_vector(theta) @ self.rotation
-
-    def chosen(self, place: Bool[Tensor, "*batch"] | tuple[int, ...]) -> "BoardProblem":
-        """The problems of a batch where a mask is true, in one leading dimension; the one at a tuple of indices."""
-        names = ("points", "noise_chol", "body_points", "centroid", "valid", "rotation")
-        correlated = None if self.correlated is None else self.correlated.chosen(place)
-        problem = replace(self, correlated=correlated, **{name: getattr(self, name)[place] for name in names})
-        if "affine_rows" in self.__dict__:  # the dear one is not computed again
-            problem.__dict__["affine_rows"] = self.affine_rows[place]
-        return problem
 
     @cached_property
     def affine_rows(self) -> Float[Tensor, "*batch boards 13 13"]:

@@ -24,7 +24,7 @@ class CorrelatedNoise:
     rows: Float[Tensor, "*batch boards 13 13"]
     log_det: Float[Tensor, "*batch"]
 
-    def chosen(self, place: Bool[Tensor, "*batch"] | tuple[int, ...]) -> "CorrelatedNoise":
+    def at(self, place: Bool[Tensor, "*batch"] | tuple[int, ...]) -> "CorrelatedNoise":
         """That of the problems where a mask is true, in a row; of the one at a tuple of indices."""
         return CorrelatedNoise(self.rows[place], self.log_det[place])
 

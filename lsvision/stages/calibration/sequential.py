@@ -32,7 +32,8 @@ def sequential(problem: BoardProblem, start: Float[Tensor, "*batch state"], conf
 
     The result is n at the end of the last scan. The passes begin at the mode of an n that stands still. Each filters
     from the same prior with the corners linearised about the pass before: the boards' poses do not move, so that their
-    last state is their smoothed one. Where a linearisation does not hold, the covariance is the second moment of an n
+    last state is their smoothed one. Corners that err together are no sequence of measurements: they are taken at once,
+    and n stands still. Where a linearisation does not hold, the covariance is the second moment of an n
     that stands still, and the random walk's.
 
     Corners that err together are no sequence of measurements: they are taken at once, and n stands still.

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from lsvision.estimation import Posterior
 from lsvision.stages.calibration.board_scale import explained_by_size, with_unknown_size
+from lsvision.stages.calibration.chosen import merged, scattered
 from lsvision.stages.calibration.config import CalibrationConfig
 from lsvision.stages.calibration.correlated import Beforehand, ErrorsAlongScan, errors_along_scan, suspicious
 from lsvision.stages.calibration.methods import estimate
@@ -31,9 +32,9 @@ class Estimate:
 
     def replaced(self, chosen: Bool[Tensor, "*batch"], part: "Estimate") -> "Estimate":
         """The same with the chosen problems' replaced by those of ``part``, in a row."""
-        scale = _scattered(chosen, part.noise_scale, self.noise_scale)
-        apart = _scattered(chosen, part.scatter, self.scatter)
-        return Estimate(_merged(chosen, part.posterior, self.posterior), scale, apart)
+        scale = scattered(chosen, part.noise_scale, self.noise_scale)
+        apart = scattered(chosen, part.scatter, self.scatter)
+        return Estimate(merged(chosen, part.posterior, self.posterior), scale, apart)
 
 
 @dataclass(frozen=True)
@@ -77,26 +78,10 @@ def estimate_white(problem: BoardProblem, start: Float[Tensor, "*batch state"], 
     found, larger = Estimate(posterior, scale, apart), scale > 1
     if not bool(larger.any()):
         return found
-    again = estimate(problem.scaled(scale).chosen(larger), start[larger], config)
+    again = estimate(problem.scaled(scale).at(larger), start[larger], config)
     return found.replaced(larger, Estimate(again, scale[larger], apart[larger]))
 
 
 def _drifts(problem: BoardProblem, config: CalibrationConfig) -> bool:
     """Whether n walks at random, so that residuals of one n are no noise."""
     return config.method == "sequential" and bool(config.process_sigma) and problem.correlated is None
-
-
-def _merged(chosen: Tensor, part: Posterior, whole: Posterior) -> Posterior:
-    length = max(len(part.path), len(whole.path))
-    paths = (torch.cat([p.path, p.path[-1:].expand(length - len(p.path), *p.path.shape[1:])]) for p in (part, whole))
-    path = [_scattered(chosen, *steps) for steps in zip(*paths, strict=True)]
-    names = ("mean", "factor", "iterations", "converged", "info")
-    merged = {name: _scattered(chosen, getattr(part, name), getattr(whole, name)) for name in names}
-    return Posterior(path=torch.stack(path), **merged)
-
-
-def _scattered(chosen: Tensor, part: Tensor, whole: Tensor) -> Tensor:
-    """A copy with the entries of a mask replaced by those of ``part``, in order."""
-    copy = whole.clone()
-    copy[chosen] = part
-    return copy

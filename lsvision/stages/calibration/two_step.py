@@ -19,6 +19,7 @@ from lsvision.stages.calibration.mode import gauss_newton_step, rows_of
 from lsvision.stages.calibration.model import rmse
 from lsvision.stages.calibration.prior import prior_about
 from lsvision.stages.calibration.problem import BoardProblem, BoardState
+from lsvision.stages.calibration.reduction import CorrelatedNoise
 
 # A result may be this far, in nats, from where one joint step of Gauss-Newton leads: a sigma of all unknowns together.
 _SETTLED = 0.5
@@ -64,6 +65,7 @@ class Middles:
     """A problem whose travel is counted from the middle of each board, ``travel`` mm behind the first line.
 
     A board's position is then where it lies when its middle is scanned, its position at travel zero less travel · n.
+    The rows of the problem on its affine maps are counted so, which linearisation takes, and not its points.
     """
 
     problem: BoardProblem
@@ -74,9 +76,9 @@ class Middles:
         """A problem counted from its boards' middles."""
         seen = problem.valid.to(problem.points)
         travel = (seen * problem.points[..., 1]).sum(-1) / seen.sum(-1)
-        counted = problem.points.clone()
-        counted[..., 1] -= travel[..., None] * seen
-        return cls(replace(problem, points=counted), travel)
+        rows = problem.affine_rows.clone()
+        rows[..., -1] -= travel[..., None] * rows[..., 1]  # whose second column is on the travel at p = 0
+        return cls(replace(problem, correlated=CorrelatedNoise(rows, problem.noise_log_det)), travel)
 
     def count(self, state: Float[Tensor, "*batch state"]) -> Float[Tensor, "*batch state"]:
         """A state of the problem as it was, in positions when the middles are scanned."""

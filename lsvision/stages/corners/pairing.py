@@ -48,9 +48,7 @@ def pair_lattices(scan: Scan, board: Board, left: SeenBoard, right: SeenBoard) -
     candidates = [_Candidate(lattice, _scale_misfit(scan, board, seen, lattice)) for lattice in fitting]
     candidates = [candidate for candidate in candidates if math.isfinite(candidate.misfit)]  # not behind the cameras
     if not candidates:
-        raise BoardNotFoundError(
-            f"{scan.path}: the left and the right image share no part of a board on the same lines"
-        )
+        raise BoardNotFoundError(f"{scan.path}: no board in both images: they share no part of one on the same lines")
     best, *others = sorted(candidates, key=lambda candidate: abs(candidate.misfit))
     whole = _COMPLETE * math.prod(board.inner)
     if not others and min(len(seen.node), len(turned.node)) >= whole:

@@ -19,7 +19,7 @@ from lsvision.schema import (
 
 Matcher = Literal["auto", "sgbm", "coarse_to_fine"]
 
-_COARSE_TO_FINE_PX = 1500  # from this width on a quarter of the size is enough to search in
+COARSE_TO_FINE_PX = 1500  # from this width on a quarter of the size is enough to search in
 
 
 @dataclass(frozen=True)
@@ -91,7 +91,7 @@ class DisparityConfig(Checked):
         """The same for lines of ``width`` px: the matcher chosen, and its own value of every option that is None."""
         own, matcher = VARIANTS[self.matcher], self.matcher
         if matcher == "auto":
-            matcher = "coarse_to_fine" if width >= _COARSE_TO_FINE_PX else "sgbm"
+            matcher = "coarse_to_fine" if width >= COARSE_TO_FINE_PX else "sgbm"
         iterations = own.refine_iterations if own.refine_iterations is not None else VARIANTS[matcher].refine_iterations
         return replace(
             self,

@@ -7,9 +7,9 @@ from functools import cached_property
 import torch
 
 from lsvision.geometry import depth_at, depth_sigma
-from lsvision.image.brightness import white_level
+from lsvision.image.stereo.relation import PairRelation
 from lsvision.stages.disparity.config import DisparityConfig
-from lsvision.stages.disparity.match import measure_block
+from lsvision.stages.disparity.match import measure_block, relation_of
 from lsvision.types import Depth, DepthSource, DepthView, Rig, Scan, StereoPair, StoredDepth
 
 
@@ -24,6 +24,7 @@ class MatchedDepth:
     rig: Rig
     config: DisparityConfig = field(default_factory=DisparityConfig)
     kept_blocks: int = 3
+    known_relation: PairRelation | None = None
     _blocks: OrderedDict[int, Depth] = field(default_factory=OrderedDict, init=False, repr=False)
 
     @property
@@ -54,19 +55,26 @@ class MatchedDepth:
         return self._blocks[index]
 
     @cached_property
-    def _white(self) -> float:
-        return white_level(self.images.left, self.images.right)
+    def relation(self) -> PairRelation:
+        """How the right image differs from the left one apart from disparity; measured when it is first needed."""
+        return self.known_relation or relation_of(self.images.left, self.images.right, self.rig, self.config)
 
     def _match(self, index: int) -> Depth:
-        match = measure_block(self.images.left, self.images.right, self.rig, self.config, self._white, index)
+        match = measure_block(self.images.left, self.images.right, self.rig, self.config, self.relation, index)
         z = depth_at(self.rig, match.disparity)
         return Depth(z, depth_sigma(self.rig, z, match.sigma) if self.config.tells_sigma else None)
 
 
-def depth_of(scan: Scan, config: DisparityConfig | None = None) -> DepthSource:
-    """The scan's own depth map where its camera computed one, else the one matched from its two images."""
+def depth_of(
+    scan: Scan, config: DisparityConfig | None = None, known_relation: PairRelation | None = None
+) -> DepthSource:
+    """The scan's own depth map where its camera computed one, else the one matched from its two images.
+
+    Args:
+        known_relation: of the two images, where it has been measured before.
+    """
     match scan.images:
         case DepthView(_, depth):
             return StoredDepth(depth)
         case StereoPair() as pair:
-            return MatchedDepth(pair, scan.rig, config or DisparityConfig())
+            return MatchedDepth(pair, scan.rig, config or DisparityConfig(), known_relation=known_relation)

@@ -7,14 +7,15 @@ import torch
 from torch import Tensor
 
 from lsvision.geometry import disparity_at_height
-from lsvision.image.brightness import gray, gray_bytes, white_level
+from lsvision.image.brightness import gray, gray_bytes
 from lsvision.image.stereo.agreement import occluded
 from lsvision.image.stereo.blocks import block_side, enlarged
-from lsvision.image.stereo.coarse_to_fine import match_coarse_to_fine
+from lsvision.image.stereo.coarse_to_fine import COARSEST, match_coarse_to_fine
 from lsvision.image.stereo.refine import RefineOptions, refine_disparity
+from lsvision.image.stereo.relation import PairRelation, measure_relation
 from lsvision.image.stereo.sgbm import GrayPair, Search, match_sgbm
 from lsvision.image.tiling import HaloRange
-from lsvision.stages.disparity.config import DisparityConfig
+from lsvision.stages.disparity.config import COARSE_TO_FINE_PX, DisparityConfig
 from lsvision.types import LineImage, Rig, TensorImage
 
 _BLANK_TEST_STEP = 9  # every ninth line shows whether a camera saw anything
@@ -47,27 +48,54 @@ def measure_strip(left: Tensor, right: Tensor, rig: Rig, config: DisparityConfig
     A block in which one of the cameras saw no more than its noise has no match anywhere.
     """
     pair = TensorImage(left), TensorImage(right)
-    white = white_level(*pair)
-    blocks = [measure_block(*pair, rig, config, white, index) for index in range(-(-len(left) // config.block_lines))]
+    relation = relation_of(*pair, rig, config)
+    count = -(-len(left) // config.block_lines)
+    blocks = [measure_block(*pair, rig, config, relation, index) for index in range(count)]
     if len(blocks) == 1:
         return blocks[0]
     return StripMatch(torch.cat([block.disparity for block in blocks]), torch.cat([block.sigma for block in blocks]))
 
 
+def relation_of(left: LineImage, right: LineImage, rig: Rig, config: DisparityConfig) -> PairRelation:
+    """How the right image of a scan differs from the left one apart from disparity."""
+    config = config.for_width(left.shape[1])
+    size = COARSEST if left.shape[1] >= COARSE_TO_FINE_PX else 1
+    return measure_relation(left, right, _search_range(rig, config), config.refine_noise, size)
+
+
 def measure_block(
-    left: LineImage, right: LineImage, rig: Rig, config: DisparityConfig, white: float, index: int
+    left: LineImage, right: LineImage, rig: Rig, config: DisparityConfig, relation: PairRelation, index: int
 ) -> StripMatch:
     """Disparity and sigma of the lines of one block, of images of any length.
 
+    Lines belong to the left image: where the cameras are out of step, the right one is read that many lines later.
+
     Args:
-        white: the largest value that pixels can have.
+        relation: of the two images, ``relation_of`` the whole scan.
         index: of the block, which begins at line ``index * config.block_lines``.
     """
     config = config.for_width(left.shape[1])
     lines = HaloRange.at(index * config.block_lines, config.block_lines, config.halo_lines or 0, left.shape[0])
-    gray_left, gray_right = (_gray(image.read(lines.outer_start, lines.outer_stop), white) for image in (left, right))
-    match = _measure(gray_left, gray_right, rig, config)
-    return StripMatch(match.disparity[lines.inner], match.sigma[lines.inner])
+    gray_left = _gray(left.read(lines.outer_start, lines.outer_stop), relation.white)
+    gray_right = _gray(_read_shifted(right, lines, relation.rows.whole), relation.white)
+    if relation.exposure is not None:
+        gray_right = relation.exposure.apply(gray_right)
+    with_gain = relation.exposure is not None or config.matcher == "sgbm"
+    match = _measure(gray_left, gray_right, rig, config, with_gain=with_gain)
+    partner = torch.arange(lines.start, lines.stop) + relation.rows.whole
+    alone = ((partner < 0) | (partner >= right.shape[0]))[:, None]
+    return StripMatch(*(values[lines.inner].masked_fill(alone, torch.nan) for values in (match.disparity, match.sigma)))
+
+
+def _read_shifted(image: LineImage, lines: HaloRange, shift: int) -> Tensor:
+    """Lines of an image, ``shift`` later than asked for; beyond its ends those are repeated."""
+    last = image.shape[0] - 1
+    start, stop = (min(max(line, 0), last) for line in (lines.outer_start + shift, lines.outer_stop - 1 + shift))
+    values = image.read(start, stop + 1)
+    if not shift:
+        return values
+    wanted = torch.arange(lines.outer_start, lines.outer_stop) + shift
+    return values[wanted.clamp(start, stop) - start]
 
 
 def _gray(image: Tensor, white: float) -> Tensor:
@@ -75,8 +103,12 @@ def _gray(image: Tensor, white: float) -> Tensor:
     return gray_bytes(image) if image.dtype == torch.uint8 else gray(image) * (255.0 / white)
 
 
-def _measure(left: Tensor, right: Tensor, rig: Rig, config: DisparityConfig) -> StripMatch:
-    """Disparity and sigma of a pair of grey images: search, then refinement."""
+def _measure(left: Tensor, right: Tensor, rig: Rig, config: DisparityConfig, *, with_gain: bool) -> StripMatch:
+    """Disparity and sigma of a pair of grey images: search, then refinement.
+
+    Args:
+        with_gain: the refinement takes a factor between their brightnesses for an unknown.
+    """
     # In noise alone every pixel would find a match somewhere.
     if any(float(image[::_BLANK_TEST_STEP].float().std()) <= config.refine_noise for image in (left, right)):
         disparity = torch.full(left.shape, torch.nan)
@@ -91,7 +123,7 @@ def _measure(left: Tensor, right: Tensor, rig: Rig, config: DisparityConfig) -> 
         iterations=config.refine_iterations,
         noise=config.refine_noise,
         largest_sigma_px=config.largest_sigma_px or math.inf,
-        with_gain=config.matcher == "sgbm",
+        with_gain=with_gain,
     )
     refined = refine_disparity(left, right, disparity, options)
     return StripMatch(refined.disparity, refined.sigma)
@@ -99,8 +131,17 @@ def _measure(left: Tensor, right: Tensor, rig: Rig, config: DisparityConfig) -> 
 
 def _search(left: Tensor, right: Tensor, rig: Rig, config: DisparityConfig) -> Tensor:
     """Disparity of a pair of grey images by the configured matcher, for each pixel or for each 2 x 2 pixels."""
+    search = _search_range(rig, config)
+    pair = GrayPair.of(left[..., None], right[..., None], white=255.0)
+    if config.matcher == "sgbm":
+        return match_sgbm(pair, search)
+    return match_coarse_to_fine(pair, search, fine_check_px=config.fine_check_px, noise=config.refine_noise)
+
+
+def _search_range(rig: Rig, config: DisparityConfig) -> Search:
+    """What is searched for on a rig."""
     minimum_px, maximum_px = disparity_range(rig, config)
-    search = Search(
+    return Search(
         minimum_px=minimum_px,
         maximum_px=maximum_px,
         block_size=config.block_size,
@@ -110,7 +151,3 @@ def _search(left: Tensor, right: Tensor, rig: Rig, config: DisparityConfig) -> T
         uniqueness_percent=config.uniqueness_percent,
         speckle_px=config.speckle_px,
     )
-    pair = GrayPair.of(left[..., None], right[..., None], white=255.0)
-    if config.matcher == "sgbm":
-        return match_sgbm(pair, search)
-    return match_coarse_to_fine(pair, search, fine_check_px=config.fine_check_px, noise=config.refine_noise)

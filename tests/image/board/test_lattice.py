@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from lsvision.image.board.lattice import QuadraticMap, SeenLattice, grow_lattice
+from lsvision.image.board.lattice import QuadraticMap, SeenLattice, grow_lattice, patches
 from lsvision.image.board.saddle_points import SaddlePoints, find_saddle_points
 
 INNER = (5, 4)
@@ -105,3 +105,20 @@ def test_evenness_depends_neither_on_contrast_nor_on_the_fall_off_of_light():
         even[contrast] = found.evenness[inside]
         assert even[contrast].max() < 1.1 * even[contrast].min()
     torch.testing.assert_close(even[80.0].mean(), even[8.0].mean(), rtol=1e-3, atol=0)
+
+
+def test_patches_are_linked_by_single_steps():
+    node = torch.tensor([[0, 0], [1, 0], [1, 1], [3, 1], [3, 2], [4, 3], [1, 1]])
+    assert patches(node).tolist() == [0, 0, 0, 3, 3, 5, 0]
+    snake = torch.tensor([[x, 0] for x in range(30)])
+    assert not patches(snake.flip(0)).any()
+    assert len(patches(torch.zeros(0, 2).long())) == 0
+
+
+def test_saddles_of_a_background_are_apart_from_the_board(nodes):
+    board = saddles_at(nodes)
+    around = torch.tensor([[x, y] for x in (-4, -3, 8, 9) for y in (-3, -1, 2, 5)])
+    background = saddles_at(around)
+    parts = ("points", "curvature", "evenness")
+    saddles = SaddlePoints(*(torch.cat([getattr(board, name), getattr(background, name)]) for name in parts))
+    assert grow_lattice(saddles, 7).on_grid.tolist() == [True] * 20 + [False] * 16

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import pytest
 import torch
 
 from lsvision.image.board.detect import detect_board
@@ -42,3 +43,21 @@ def test_stereo_baseline_of_opencvs_photographs(shared_data: Path):
     )
     baseline, after = result[6].ravel(), published["after_optimisation"]
     assert (np.abs(baseline - after["T_mm"]) <= after["T_err_3sigma"]).all(), baseline
+
+
+@pytest.mark.parametrize("name", ["left01", "right05", "left13"])
+@pytest.mark.parametrize("side", ["left", "right", "top", "bottom"])
+def test_boards_cut_off_by_the_rim_of_a_photograph(shared_data: Path, name: str, side: str):
+    folder = shared_data / "checkerboard_opencv_stereo"
+    whole = corners_of(folder, f"{name}.jpg").position
+    image = torch.from_numpy(cv2.imread(str(folder / f"{name}.jpg"), cv2.IMREAD_GRAYSCALE))[..., None]
+    first, last = whole.amin(0), whole.amax(0)
+    # A fifth of the corners' extent is one to two squares.
+    u, v = (first + 0.2 * (last - first)).int().tolist()
+    right, bottom = (last - 0.2 * (last - first)).int().tolist()
+    part = {"left": image[:, u:], "right": image[:, :right], "top": image[v:], "bottom": image[:bottom]}[side]
+    shift = torch.tensor([float(u) * (side == "left"), float(v) * (side == "top")]).double()
+    detected = detect_board(TensorImage(part.contiguous()), BOARD)
+    assert detected is not None
+    assert int(detected.valid.sum()) >= 30
+    assert (detected.position + shift - whole)[detected.valid].abs().max() < 0.2

@@ -46,15 +46,58 @@ def test_sigma_is_that_of_the_errors_on_a_photograph(motorcycle):
     assert 0.8 < ratio.square().mean().sqrt() < 1.3
 
 
-def test_no_more_pixels_are_bad_than_with_opencv(motorcycle):
-    left, right, truth = motorcycle
+def matched_by_opencv(left: torch.Tensor, right: torch.Tensor) -> torch.Tensor:
+    """Disparities of OpenCV's matcher alone."""
     grey = [cv2.cvtColor(image.numpy(), cv2.COLOR_RGB2GRAY) for image in (left, right)]
     peer = cv2.StereoSGBM.create(
         minDisparity=0, numDisparities=HIGHEST_PX + 1, blockSize=5, P1=8 * 25, P2=32 * 25, disp12MaxDiff=10,
         uniquenessRatio=5, speckleWindowSize=100, speckleRange=1, mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY,
     )  # fmt: skip
     expected = torch.from_numpy(peer.compute(*grey)).float() / 16
-    expected = torch.where(expected >= 0, expected, torch.nan)
+    return torch.where(expected >= 0, expected, torch.nan)
+
+
+def seen_with(image: torch.Tensor, exposure: str) -> torch.Tensor:
+    """The image as a camera of another exposure would take it."""
+    value, across = image.float(), torch.linspace(-1, 1, image.shape[1])[None, :, None]
+    exposed = {
+        "darker": 0.8 * value,
+        "brighter": 1.25 * value,
+        "more offset": value + 10,
+        "less offset": value - 10,
+        "gamma": 255 * (value / 255).pow(0.8),
+        "vignetting": value * (1 - 0.45 * across.square()),
+        "half lit": value * (0.775 - 0.225 * across),
+    }
+    return exposed[exposure].round().clamp(0, 255).to(torch.uint8)
+
+
+@pytest.mark.parametrize(
+    "exposure", ["darker", "brighter", "more offset", "less offset", "gamma", "vignetting", "half lit"]
+)
+def test_no_exposure_of_the_right_camera_harms_more_than_opencv(motorcycle, exposure):
+    left, right, truth = motorcycle
+    right = seen_with(right, exposure)
+    ours, expected = matched(left, right).disparity, matched_by_opencv(left, right)
+    known = [float(disparity[torch.isfinite(truth)].isfinite().float().mean()) for disparity in (ours, expected)]
+    assert known[0] >= known[1]
+    assert bad_share(ours, truth) <= bad_share(expected, truth)
+    assert bad_share(ours, truth) < 0.205  # as with equal exposures, where 0.192 are bad
+
+
+@pytest.mark.parametrize("offset", [1, -2])
+def test_cameras_out_of_step_match_as_those_in_step(motorcycle, offset):
+    left, right, truth = motorcycle
+    late = right[(torch.arange(len(right)) - offset).clamp(0, len(right) - 1)]
+    match = matched(left, late)
+    beyond = slice(-offset, None) if offset > 0 else slice(0, -offset)  # the right camera saw no such lines
+    assert match.disparity[beyond].isnan().all()
+    assert bad_share(match.disparity, truth) < 0.205
+
+
+def test_no_more_pixels_are_bad_than_with_opencv(motorcycle):
+    left, right, truth = motorcycle
+    expected = matched_by_opencv(left, right)
     match = matched(left, right, largest_sigma_px=0.2)
     assert bad_share(expected, truth) == pytest.approx(0.2148, abs=0.01)
     assert bad_share(match.disparity, truth) <= bad_share(expected, truth)

@@ -102,6 +102,28 @@ def test_sigma_is_that_of_the_errors(sheet):
     assert abs(normalised.abs().nanmedian() / 0.6745 - 1) < 0.3
 
 
+@pytest.mark.parametrize("config", [CONFIG, FINE])
+def test_a_darker_right_camera_out_of_step_changes_little(sheet, config):
+    source, scan = sheet
+    left, right = scan.left.read(0, scan.lines), scan.images.right.read(0, scan.lines)
+    late = 0.75 * right[(torch.arange(scan.lines) - 2).clamp(min=0)].float() + 8
+    across = torch.linspace(-1, 1, right.shape[1])[None, :, None]
+    other = (late * (1 - 0.3 * across.square())).round().to(torch.uint8)
+    images = StereoPair(scan.left, TensorImage(other))
+    matched = MatchedDepth(images, scan.rig, config)
+    depth, inside = matched.read(0, scan.lines).z, (slice(40, -40), slice(80, -80))
+    assert matched.relation.rows.whole == 2
+    assert matched.relation.exposure is not None
+    assert depth[-2:].isnan().all()
+    truth = torch.cat(list(source.depth_strips()))
+    equal = depth_at(SMALL_RIG, measure_strip(left, right, SMALL_RIG, config).disparity)
+    error, expected = (to_disparity(each, truth)[inside] for each in (depth, equal))
+    assert error.isfinite().float().mean() >= expected.isfinite().float().mean() - 0.003
+    assert error.abs().nanmedian() <= 1.2 * expected.abs().nanmedian()
+    apart = MatchedDepth(images, scan.rig, config, known_relation=matched.relation).read(70, 100).z
+    torch.testing.assert_close(apart, depth[70:100], rtol=0, atol=0, equal_nan=True)
+
+
 def test_sigma_of_depth_follows_the_triangulation():
     disparity, column = torch.tensor([-30.0, 0.0, 12.5]).double(), torch.tensor([10.0, 200.0, 400.0]).double()
     depth = triangulate(SMALL_RIG, column, disparity)[1]
