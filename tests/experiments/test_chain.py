@@ -106,7 +106,9 @@ def test_a_board_of_another_size_is_one_line_with_its_verdict_and_its_files_are_
     assert command("+experiment=calibrate", f"scans=[{listed}]", "board.square_mm=30.928") == 1
     file = tmp_path / "run" / "calibration.json"
     (line,) = capsys.readouterr().err.splitlines()
-    assert line.startswith(f"error: {file}: the calibration is inconsistent: the RMSE grew from")
+    assert line.startswith(f"error: {file}: the calibration is inconsistent: the board looks ")
+    assert "smaller than its 30.928 mm squares: they measure 30 mm" in line
+    assert "the RMSE grew from" in line
     assert read_calibration(file).verdict == "inconsistent"
     summary = json.loads((tmp_path / "run" / "summary.json").read_text())
     assert summary["verdict"] == "inconsistent"

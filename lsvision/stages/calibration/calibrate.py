@@ -174,7 +174,8 @@ def _solve(measured: BoardMeasurements, config: CalibrationConfig) -> _Solution:
     config = config.resolved()
     _check(config, measured.points.shape[-3])
     posed = SoundProblem.of(measured, _mounting_pitch(config))
-    off = outlying(posed.problem)
+    drifts = config.method == "sequential" and bool(config.process_sigma)  # no affine map fits where n walks
+    off = torch.zeros_like(posed.problem.valid) if drifts else outlying(posed.problem)
     if bool(off.any()):
         posed = SoundProblem.of(replace(measured, valid=measured.valid & ~off), _mounting_pitch(config))
     found = estimate_with_noise(posed.problem, posed.start, config)

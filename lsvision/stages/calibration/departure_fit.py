@@ -17,7 +17,7 @@ from lsvision.estimation import apply
 from lsvision.stages.calibration.departures import KINDS, Placement, ReducedCorners, residual_and_jacobian
 
 _POSE, _MOTION = 6, 3
-_SETTLED = 1e-4  # squared length of a step, in sigmas
+_SETTLED = 1e-2  # squared length of a step, in sigmas; the evidence is that at its end
 
 
 @dataclass(frozen=True)

@@ -51,6 +51,13 @@ class Placement:
         position = self.position + pose[..., 3:]
         return Placement(rotation, position, self.n + n, self.departure + departure, self.wander + wander)
 
+    def at_poses_of(self, other: "Placement", chosen: Bool[Tensor, "*batch"]) -> "Placement":
+        """The placement with another's poses and n in the chosen problems, its departures unchanged."""
+        rotation = torch.where(chosen[..., None, None, None], other.rotation, self.rotation)
+        position = torch.where(chosen[..., None, None], other.position, self.position)
+        n = torch.where(chosen[..., None], other.n, self.n)
+        return Placement(rotation, position, n, self.departure, self.wander)
+
     def expanded(self, batch: tuple[int, ...]) -> "Placement":
         """The placement with another batch's leading dimensions."""
         inner = (3, 2, 1, 2, 2)

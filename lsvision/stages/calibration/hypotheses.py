@@ -100,6 +100,7 @@ class _Search:
         """Rounds until no move is worth it."""
         threshold = math.log(_ACCEPTED)
         here = plain = self.fitted(self.hypothesis())
+        self.start = self.start.at_poses_of(plain.at, plain.converged)  # mostly near what the causes lead to
         alone = torch.full_like(plain.log_evidence, -torch.inf)
         chosen_alone = self.wander.clone()
         for number in range(_ROUNDS):

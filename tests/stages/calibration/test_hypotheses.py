@@ -75,10 +75,10 @@ def test_the_cause_is_named():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("sigma", [SIGMA, DETECTED])
-def test_the_cause_is_named_in_95_of_100_sets(sigma):
+@pytest.mark.parametrize(("sigma", "sets"), [(SIGMA, SLOW), (DETECTED, 40)])
+def test_the_cause_is_named_in_95_of_100_sets(sigma, sets):
     torch.manual_seed(1)
-    for corners, expected in cases(SLOW, sigma):
+    for corners, expected in cases(sets, sigma):
         right, found = share(corners, expected)
         assert right >= 0.95, (expected, found)
 
@@ -94,10 +94,11 @@ def test_a_drift_in_depth_is_named_or_stands_beside_the_drift_sideways_that_look
 
 
 def sound_sets(sets):
-    for tilts in (THREE[:2], THREE, EIGHT):
+    for tilts in (THREE[:2], THREE):
         for factor in (1.0, 2.0, 0.5):
             yield noisier_than_stated(tilts, sets, factor)
     yield noisier_than_stated(THREE, sets, 1.0, DETECTED)
+    yield noisier_than_stated(EIGHT, sets, 1.0)
 
 
 def test_sound_boards_have_no_cause():
@@ -114,7 +115,7 @@ def test_false_alarms_are_rarer_than_two_in_a_hundred():
         assert right >= 0.98, found
 
 
-@pytest.mark.parametrize("sets", [FAST, pytest.param(SLOW, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("sets", [FAST, pytest.param(50, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("wavelength", [61.0, 97.0, 233.0, 480.0])
 def test_a_shake_is_called_a_shake_and_no_motion_of_single_scans(wavelength, sets):
     torch.manual_seed(5)
