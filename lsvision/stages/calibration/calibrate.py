@@ -52,6 +52,10 @@ def calibrate(boards: Sequence[BoardCorners], rig: Rig, config: CalibrationConfi
             if bad:
                 raise CalibrationError(f"{board.scan}: {flaw.value}")
     solution = _solve(measured, config)
+    assumed = Assumed(config.prior_sigma, config.board_scale_sigma)
+    findings = find_flaws(boards, solution.problem, solution.start, solution.outlying, assumed)
+    if findings.contradictions and bool(solution.along_scan.found):  # they are no errors along the scan
+        solution = _solve(measured, replace(config, correlated_odds=math.inf))
     batch, scale = solution.summary(), float(solution.noise_scale)
     if int(batch.info) == Info.SINGULAR:
         raise CalibrationError(
@@ -62,8 +66,6 @@ def calibrate(boards: Sequence[BoardCorners], rig: Rig, config: CalibrationConfi
     observability = observe(solution.weighed, solution.posterior.mean, known)
     iterations, converged = iterations_of(batch), bool(batch.converged)
     before_mm, after_mm = iterations[0].rmse_mm, iterations[-1].rmse_mm
-    assumed = Assumed(config.prior_sigma, config.board_scale_sigma)
-    findings = find_flaws(boards, solution.problem, solution.start, solution.outlying, assumed)
     along_scan = errors_along_scan_of(batch)
     contradictions = [*findings.contradictions, *rmse_grew(before_mm, after_mm)]
     if scale > 1 or along_scan:  # where the residuals are no noise as stated

@@ -50,8 +50,9 @@ def estimate_with_noise(
     """Posteriors by the configured method; where residuals are correlated along the scan, those that allow for it."""
     found = estimate_white(problem, start, config)
     whitened = residuals_in_sigmas(problem, found.posterior.mean)
-    finite = torch.isfinite(found.posterior.factor).all((-2, -1)) & math.isfinite(config.correlated_odds)
-    doubtful = finite & suspicious(problem, whitened / found.noise_scale.sqrt()[..., None, None, None])
+    # Residuals of a result that has not converged say nothing of the corners.
+    settled = found.posterior.converged & math.isfinite(config.correlated_odds)
+    doubtful = settled & suspicious(problem, whitened / found.noise_scale.sqrt()[..., None, None, None])
     known = Beforehand(config.prior_sigma, config.process_sigma or 0.0, config.correlated_odds)
     along = errors_along_scan(problem, found.posterior.mean, doubtful, known)
     if bool(along.found.any()):

@@ -20,15 +20,15 @@ class Judgement:
 def judge(not_settled: str | None, contradictions: Sequence[str], observability: Observability) -> Judgement:
     """The verdict on a calibration.
 
-    Every reason that holds is given, whatever the verdict. That the estimate did not settle comes first: boards cannot
-    be said to contradict a result that is none.
+    That the estimate did not settle comes first: boards cannot be said to contradict a result that is none. Which scan
+    would show more is said only where nothing contradicts: another scan mends neither a wrong board nor a wrong speed.
 
     Args:
         not_settled: the sentence that says so; None where the estimate converged.
         contradictions: sentences, one for each way in which the boards contradict each other, the options or the
             model.
     """
-    unseen = () if observability.determined else (observability.advice,)
+    unseen = () if observability.determined or contradictions else (observability.advice,)
     reasons = (*(() if not_settled is None else (not_settled,)), *contradictions, *unseen)
     if not_settled is not None:
         return Judgement("not converged", reasons)
