@@ -74,12 +74,14 @@ class Travel:
     """Nominal travel of the object by line: constant pitch, or an encoder's position log.
 
     ``positions_mm`` holds one position per line, increasing, and replaces the pitch where it is given. A reversed
-    transport makes later lines see smaller Y.
+    transport makes later lines see smaller Y. ``sigma_mm`` is the standard deviation of the positions of a log that was
+    repaired, above zero on the lines that were; None where none was.
     """
 
     line_pitch_mm: Positive
     positions_mm: Float[Tensor, " lines"] | None = None
     transport: Transport = "forward"
+    sigma_mm: Float[Tensor, " lines"] | None = None
 
 
 @runtime_checkable

@@ -14,7 +14,7 @@ from lsvision.io.atomic import check_replaceable
 from lsvision.io.inside import path_inside
 from lsvision.io.product.layout import ROOT_METADATA
 from lsvision.stages.correction.grid import source_dtype
-from lsvision.stages.correction.uncertainty import drift_per_metre
+from lsvision.stages.correction.uncertainty import EncoderRepair, drift_per_metre
 from lsvision.stages.disparity.depth import relation_of_scan
 
 log = logging.getLogger(__name__)
@@ -51,6 +51,7 @@ def product_layout(planned: PlannedScan, processing: Processing, input_sha256: s
             "%s: the cameras are out of step by %+.2f ± %.2f lines: the right image is matched %+d lines later",
             scan.path, relation.rows.lines, relation.rows.sigma, relation.rows.whole,
         )  # fmt: skip
+    repair = EncoderRepair.of(scan.travel)
     calibration = planned.calibration.calibration
     motion = calibration.motion
     sideways, in_depth = motion.drift_mm_per_m
@@ -75,6 +76,7 @@ def product_layout(planned: PlannedScan, processing: Processing, input_sha256: s
             "drift_sigma_mm_per_m": list(drift_per_metre(motion)),
             "disparity": asdict(processing.disparity),
             **({"pair": relation.metadata} if relation is not None else {}),
+            **({"encoder_repair": asdict(repair)} if repair is not None else {}),
             "correction": asdict(planned.correction),
             "key": key,
         },

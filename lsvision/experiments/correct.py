@@ -48,6 +48,8 @@ class ProductSummary:
     standard deviation of (q_x, q_y, q_z) per metre of the object, mm, that the calibration's uncertainty causes.
     ``pair`` is how the right image differed from the left one apart from disparity: lines by which it was late, of
     which whole ones were taken into account, its gain, offset and curve; None where the camera measured the depth.
+    ``encoder_repair`` has the number of lines whose travel was interpolated and the largest standard deviation of their
+    travel, mm; None where none was.
     """
 
     path: str
@@ -61,6 +63,7 @@ class ProductSummary:
     motion_mm_per_m: tuple[float, float]
     drift_mm_per_m: tuple[float, ...]
     pair: dict[str, Any] | None
+    encoder_repair: dict[str, Any] | None
 
 
 def run_correct(settings: CorrectSettings, folder: Path) -> None:
@@ -87,6 +90,11 @@ def run_correct(settings: CorrectSettings, folder: Path) -> None:
     log.info("calibration %s, corrected motion %s", summary.verdict, drift_in_words(motion))
     if summary.pair is not None:
         log.info("%s", _pair_in_words(summary.pair))
+    if summary.encoder_repair is not None:
+        log.info(
+            "encoder log repaired: travel of %d lines interpolated, known to %.2g mm at worst",
+            summary.encoder_repair["repaired_lines"], summary.encoder_repair["largest_sigma_mm"],
+        )  # fmt: skip
 
 
 def _pair_in_words(pair: Mapping[str, Any]) -> str:
@@ -108,6 +116,12 @@ def _pair_in_words(pair: Mapping[str, Any]) -> str:
     return f"right image {rows}; {bright}"
 
 
+def _entry(metadata: Mapping[str, Any], name: str) -> dict[str, Any] | None:
+    """A group of a product's metadata; None where it has none of that name."""
+    entry = metadata.get(name)
+    return dict(entry) if isinstance(entry, Mapping) else None
+
+
 def make_product(planned: PlannedScan, processing: Processing, output: Path, bars: ProgressBars) -> ProductSummary:
     """Make a scan's product as the archive does, in this process, under a bar over its rows."""
     keep_freed_memory()
@@ -118,7 +132,7 @@ def make_product(planned: PlannedScan, processing: Processing, output: Path, bar
         bars.advance(bar, product_rows(task, outcome))
 
     product = process_one(planned, processing, output, advance)
-    pair = read_product(product.path).metadata.get("pair")
+    metadata = read_product(product.path).metadata
     return ProductSummary(
         path=str(product.path),
         rows=grid.rows,
@@ -130,5 +144,6 @@ def make_product(planned: PlannedScan, processing: Processing, output: Path, bar
         verdict=planned.calibration.calibration.verdict,
         motion_mm_per_m=planned.calibration.calibration.motion.drift_mm_per_m,
         drift_mm_per_m=drift_per_metre(planned.calibration.calibration.motion),
-        pair=dict(pair) if isinstance(pair, Mapping) else None,
+        pair=_entry(metadata, "pair"),
+        encoder_repair=_entry(metadata, "encoder_repair"),
     )

@@ -22,7 +22,7 @@ from lsvision.geometry.camera import (
     triangulation_jacobian,
     zero_disparity_mm,
 )
-from lsvision.geometry.motion import displace, line_at, scan_position, travel_at
+from lsvision.geometry.motion import displace, line_at, scan_position, travel_at, travel_sigma
 from lsvision.geometry.product import (
     ProductFrame,
     aligned_rotation,
@@ -74,6 +74,7 @@ __all__ = [
     "to_product",
     "transform",
     "travel_at",
+    "travel_sigma",
     "triangulate",
     "triangulate_general",
     "triangulation_jacobian",

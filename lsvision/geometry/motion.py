@@ -44,6 +44,16 @@ def travel_at(travel: Travel, line: Float[Tensor, "*batch"]) -> Float[Tensor, "*
     return sign * (inside + travel.line_pitch_mm * beyond)
 
 
+def travel_sigma(travel: Travel, line: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+    """Standard deviation, mm, of the travel from the first line to (fractional) lines; zero but in a repaired log."""
+    if travel.sigma_mm is None:
+        return torch.zeros_like(line)
+    sigma = travel.sigma_mm.to(line)
+    base = line.detach().nan_to_num().floor().clamp(0, max(len(sigma) - 2, 0)).long()  # a NaN stays one by its weight
+    at_line = torch.lerp(sigma[base], sigma[(base + 1).clamp(max=len(sigma) - 1)], (line - base).clamp(0, 1))
+    return at_line.hypot(sigma[0])
+
+
 def line_at(travel: Travel, travel_mm: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
     """Fractional line that was scanned at a nominal travel y, mm: the inverse of ``travel_at``.
 

@@ -1,16 +1,19 @@
 """One scan: the same product as from an archive, byte for byte, and never in the place of another scan's."""
 
+import json
+import logging
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import torch
 
 from lsvision.archive import EngineConfig, plan_one, process_one, sole_run
 from lsvision.archive.work import CorrectStrip, FinishProduct
 from lsvision.errors import LsvisionError, ScansFailedError
 from lsvision.experiments.correct import CorrectSettings, run_correct
 from lsvision.experiments.reprocess import ReprocessSettings, run_reprocess
-from lsvision.io import read_product
+from lsvision.io import read_product, write_encoder
 from tests.archive.archives import (
     PROCESSING,
     assert_same_products,
@@ -21,14 +24,15 @@ from tests.archive.archives import (
 )
 
 
-def correct(scan: Path, calibration: Path, output: Path) -> None:
+def correct(scan: Path, calibration: Path, output: Path, **options) -> None:
     settings = CorrectSettings(
         name="correct",
         scan=str(scan),
         calibration=str(calibration),
         output=str(output),
         disparity=PROCESSING.disparity,
-        correction=PROCESSING.correction,
+        correction=options.pop("correction", PROCESSING.correction),
+        **options,
     )
     run_correct(settings, output.with_name(f"{output.name}-run"))
 
@@ -159,3 +163,25 @@ def test_a_scan_file_stands_for_its_folder(archive, calibration, tmp_path):
     planned = plan_one(archive / "a" / "scan.yaml", calibration, PROCESSING)
     assert planned.files == plan_one(archive / "a", calibration, PROCESSING).files
     assert process_one(planned, PROCESSING, tmp_path, ignore).path == tmp_path / "a.zarr"
+
+
+def test_a_repaired_encoder_log_is_stated_and_part_of_sigma(tmp_path, monkeypatch, caplog):
+    monkeypatch.setattr("lsvision.experiments.correct.product_report", lambda *_: None)  # takes seconds
+    scan, calibration = make_scan(tmp_path / "a"), make_calibration(tmp_path / "calibration.json")
+    line = torch.arange(96).double()
+    write_encoder(1.12 * (line + 2 * torch.sin(line / 5)), scan / "encoder.csv")
+    rows = (scan / "encoder.csv").read_text().splitlines()
+    (scan / "encoder.csv").write_text("\n".join(rows[:41] + rows[51:]) + "\n")  # without lines 40 to 49
+    (scan / "scan.yaml").write_text((scan / "scan.yaml").read_text() + "encoder: encoder.csv\n")
+    caplog.set_level(logging.INFO)
+    correction = replace(PROCESSING.correction, uncertainty=True)
+    correct(scan, calibration, tmp_path / "out", correction=correction, repair_encoder=True)
+    repair = json.loads((tmp_path / "out-run" / "summary.json").read_text())["encoder_repair"]
+    assert repair["repaired_lines"] == 10
+    assert "travel of 10 lines interpolated, known to" in caplog.text
+    product = read_product(tmp_path / "out" / "a.zarr")
+    assert product.metadata["encoder_repair"] == repair
+    sigma, line = (product.sigma(0, product.shape[0])[..., 1], product.source(0, product.shape[0])[..., 0])
+    largest = repair["largest_sigma_mm"]
+    assert float(sigma[(line - 44.5).abs() < 3].nanquantile(0.9)) > 0.6 * largest
+    assert float(sigma[(line < 38) | (line > 52)].nanquantile(0.9)) < 0.3 * largest

@@ -3,7 +3,9 @@
 import csv
 import io
 import logging
+import math
 from bisect import bisect_left
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +16,7 @@ from torch import Tensor
 
 from lsvision.errors import FileFormatError
 from lsvision.io.atomic import write_text
+from lsvision.io.formats.encoder_sigma import interpolation_sigma
 from lsvision.io.formats.validation import read_text
 
 HEADER = ["line", "position_mm"]
@@ -30,10 +33,25 @@ _CLOSE = 1e-6  # part of the way to the next good reading that lines of a halt a
 logger = logging.getLogger(__name__)
 
 
+@dataclass(frozen=True)
+class EncoderLog:
+    """Positions by line, mm, with their standard deviation, above zero where a line was repaired; None: none was."""
+
+    positions_mm: Float[Tensor, " lines"]
+    sigma_mm: Float[Tensor, " lines"] | None = None
+
+
 def read_encoder(
     path: Path | str, lines: int, *, line_pitch_mm: float | None = None, repair: bool = False
 ) -> Float[Tensor, " lines"]:
-    """Positions, mm, of the first ``lines`` lines of a log with the header ``line,position_mm``.
+    """Positions, mm, of the lines of a log: those of ``read_encoder_log``."""
+    return read_encoder_log(path, lines, line_pitch_mm=line_pitch_mm, repair=repair).positions_mm
+
+
+def read_encoder_log(
+    path: Path | str, lines: int, *, line_pitch_mm: float | None = None, repair: bool = False
+) -> EncoderLog:
+    """The first ``lines`` lines of a log with the header ``line,position_mm``.
 
     Args:
         line_pitch_mm: nominal pitch, which the advance of a line is compared with; None where there is none.
@@ -53,17 +71,19 @@ def read_encoder(
         raise FileFormatError(path, problem)
     faults = _faults(line, position, lines)
     if not faults:
-        return torch.from_numpy(position)
+        return EncoderLog(torch.from_numpy(position))
     if not repair:
         raise FileFormatError(path, f"{faults}; repair was not asked for")
+    counter_sigma = 0.0
     if line_pitch_mm is not None:
         resolution = counter_resolution(line, position)
         if resolution > _COARSE * line_pitch_mm:
             faults = f"{faults}; the readings are multiples of {resolution:g} mm, between which lines are interpolated"
             position = without_counter_steps(line, position, resolution / line_pitch_mm)
-    repaired = _repaired(path, line, position, lines)
+            counter_sigma = resolution / math.sqrt(12)  # of a position anywhere in a step
+    repaired = _repaired(path, line, position, counter_sigma)
     logger.warning("%s: repaired by interpolation: %s", path, faults)
-    return torch.from_numpy(repaired)
+    return repaired
 
 
 def write_encoder(positions_mm: Float[Tensor, " lines"], path: Path | str) -> None:
@@ -141,7 +161,7 @@ def _listed(lines: NDArray[np.int64]) -> str:
     return f"line {shown}" if lines.size == 1 else f"{lines.size} lines ({shown}{', ...' if lines.size > 5 else ''})"
 
 
-def _repaired(path: Path, line: NDArray[np.int64], position: NDArray[np.float64], lines: int) -> NDArray[np.float64]:
+def _repaired(path: Path, line: NDArray[np.int64], position: NDArray[np.float64], counter_sigma: float) -> EncoderLog:
     """Positions with every line outside the longest increasing run of readings interpolated.
 
     Where the object stood or went back, the lines in between saw it again where it had been already: they are put
@@ -154,7 +174,7 @@ def _repaired(path: Path, line: NDArray[np.int64], position: NDArray[np.float64]
     good = good[step > _CLOSE * np.median(step[1:])] if len(good) > 1 else good  # rounding is no progress
     pieces = np.split(good, np.flatnonzero(_jumps(line[good], position[good])) + 1)
     good = max(pieces, key=len)  # what lies beyond a jump is wrong, be it the last reading alone
-    if line[good[0]] != 0 or line[good[-1]] != lines - 1:
+    if line[good[0]] != 0 or line[good[-1]] != line[-1]:
         raise FileFormatError(path, "cannot be repaired: the first or the last line has no good reading")
     elapsed, advance = np.diff(line[good]), np.diff(position[good])
     stood = (elapsed > 1) & (advance < _STANDSTILL * np.median(advance / elapsed) * elapsed)
@@ -165,7 +185,9 @@ def _repaired(path: Path, line: NDArray[np.int64], position: NDArray[np.float64]
     values = np.where(early, position[before] + _CLOSE * advance, position[after] - _CLOSE * advance)
     knots, values = np.append(line[good], knots), np.append(position[good], values)
     order = np.argsort(knots)
-    return np.interp(np.arange(lines), knots[order], values[order])
+    repaired = np.interp(np.arange(line[-1] + 1), knots[order], values[order])
+    sigma = np.hypot(interpolation_sigma(line[good], position[good], stood), counter_sigma)
+    return EncoderLog(torch.from_numpy(repaired), torch.from_numpy(sigma))
 
 
 def counter_resolution(line: NDArray[np.int64], position: NDArray[np.float64]) -> float:

@@ -12,7 +12,7 @@ from torch import Tensor
 from lsvision.errors import FileFormatError
 from lsvision.geometry import zero_disparity_mm
 from lsvision.io.atomic import partial_folder, write_text
-from lsvision.io.formats.encoder import read_encoder, write_encoder
+from lsvision.io.formats.encoder import read_encoder_log, write_encoder
 from lsvision.io.formats.rig import read_rig, write_rig
 from lsvision.io.formats.validation import named_file, read_entries, read_yaml
 from lsvision.io.images.depth_map import PlausibleDepth
@@ -117,11 +117,16 @@ def read_scan(path: Path | str, *, repair_encoder: bool = False) -> Scan:
         images["depth"] = _plausible_depth(file, rig, images["depth"])
     pitch = entries.line_pitch_mm
     log = files.get("encoder")
-    positions = read_encoder(log, left.shape[0], line_pitch_mm=pitch, repair=repair_encoder) if log else None
+    read = read_encoder_log(log, left.shape[0], line_pitch_mm=pitch, repair=repair_encoder) if log else None
     return Scan(
         path=file.parent,
         rig=rig,
-        travel=Travel(pitch, positions, entries.transport or "forward"),
+        travel=Travel(
+            pitch,
+            read.positions_mm if read else None,
+            entries.transport or "forward",
+            sigma_mm=read.sigma_mm if read else None,
+        ),
         images=StereoPair(left, images["right"]) if "right" in images else DepthView(left, images["depth"]),
         color_registered=entries.color_registered is not False,
         attributes={name: str(value) for name, value in (entries.attributes or {}).items()},

@@ -1,11 +1,13 @@
-"""How well a product's positions are known, from the sigma of the depth and of the motion."""
+"""How well a product's positions are known, from the sigma of the depth, of the motion and of a repaired travel."""
+
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from lsvision.geometry import ProductFrame, motion_sigma, travel_at
-from lsvision.types import Motion
+from lsvision.geometry import ProductFrame, motion_sigma, travel_at, travel_sigma
+from lsvision.types import Motion, Travel
 
 
 def position_sigma(
@@ -18,7 +20,8 @@ def position_sigma(
     """Standard deviation, mm, of (q_x, q_y, q_z) of cells, relative to the first line of their scan.
 
     An error of the depth moves a point along its ray; an error of n displaces it in proportion to its travel from the
-    first line.
+    first line; an error of the travel of a repaired line moves it along the motion. What no log shows, as vibration
+    from line to line, is not part of it.
 
     Args:
         covariance: of n. column, line: position in the scan that a cell came from, px.
@@ -26,7 +29,25 @@ def position_sigma(
     """
     along_ray = frame.ray(column) * depth_sigma[..., None]
     travel = travel_at(frame.travel, line) - travel_at(frame.travel, line.new_zeros(()))
-    return torch.hypot(along_ray, travel[..., None] * motion_sigma(frame.n, covariance))
+    sigma = torch.hypot(along_ray, travel[..., None] * motion_sigma(frame.n, covariance))
+    if frame.travel.sigma_mm is not None:
+        sigma[..., 1] = sigma[..., 1].hypot(frame.stretch * travel_sigma(frame.travel, line))
+    return sigma
+
+
+@dataclass(frozen=True)
+class EncoderRepair:
+    """Lines of a scan whose travel was interpolated, and the largest standard deviation of their travel, mm."""
+
+    repaired_lines: int
+    largest_sigma_mm: float
+
+    @classmethod
+    def of(cls, travel: Travel) -> "EncoderRepair | None":
+        """What was repaired of a scan's travel; None where nothing was."""
+        if travel.sigma_mm is None:
+            return None
+        return cls(int((travel.sigma_mm > 0).sum()), float(travel.sigma_mm.max()))
 
 
 def drift_per_metre(motion: Motion) -> tuple[float, ...]:

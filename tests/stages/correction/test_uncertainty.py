@@ -9,7 +9,7 @@ import torch
 from lsvision.geometry import ProductFrame, depth_sigma, displace, focal_length_px, product_axes
 from lsvision.stages.correction.config import CorrectionConfig
 from lsvision.stages.correction.correct import correct_scan
-from lsvision.stages.correction.uncertainty import drift_per_metre, position_sigma
+from lsvision.stages.correction.uncertainty import EncoderRepair, drift_per_metre, position_sigma
 from lsvision.stages.disparity.depth import depth_of
 from lsvision.types import DepthView, Motion, Scan, StoredDepth, TensorImage, Travel
 from tests.stages.rendered import PITCH, SMALL_RIG
@@ -54,6 +54,24 @@ def test_by_hand() -> None:
     assert drift_per_metre(motion) == pytest.approx((1.0, 2.0, 3.0))
     longer = dataclasses.replace(motion, n=2 * motion.n)
     assert drift_per_metre(longer) == pytest.approx((0.5, 1.0, 1.5))
+
+
+@pytest.mark.parametrize("transport", ["forward", "reverse"])
+def test_repaired_travel_moves_points_along_the_motion(transport) -> None:
+    travel_sigma_mm = torch.zeros(500, dtype=torch.float64)
+    travel_sigma_mm[100:200] = 0.7
+    plain = Travel(PITCH, PITCH * torch.arange(500, dtype=torch.float64), transport)
+    repaired = dataclasses.replace(plain, sigma_mm=travel_sigma_mm)
+    line = torch.tensor([50.0, 99.5, 150.0, 300.0]).double()
+    cell = torch.full_like(line, 400.0), line, torch.full_like(line, 0.3)
+    without, found = (
+        position_sigma(ProductFrame(SMALL_RIG, t, N), MOTION.covariance, *cell) for t in (plain, repaired)
+    )
+    assert torch.equal(found[:, ::2], without[:, ::2])
+    added = torch.linalg.vector_norm(N) * torch.tensor([0.0, 0.35, 0.7, 0.0]).double()
+    torch.testing.assert_close(found[:, 1], without[:, 1].hypot(added))
+    assert EncoderRepair.of(plain) is None
+    assert EncoderRepair.of(repaired) == EncoderRepair(100, 0.7)
 
 
 @pytest.mark.parametrize("known", [False, True])
