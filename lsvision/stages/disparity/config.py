@@ -26,13 +26,14 @@ COARSE_TO_FINE_PX = 1500  # from this width on a quarter of the size is enough t
 class Variant:
     """The values that a matcher gives to options that are None."""
 
-    refine_iterations: int | None  # None: those of the matcher that the width asks for
+    refine_iterations: int
     largest_sigma_px: float
     halo_lines: int
 
 
 VARIANTS: dict[Matcher, Variant] = {
-    "auto": Variant(refine_iterations=None, largest_sigma_px=0.2, halo_lines=48),
+    # Of narrow lines. There 0.2 px drops more right pixels of photographs than OpenCV misses.
+    "auto": Variant(refine_iterations=2, largest_sigma_px=0.22, halo_lines=48),
     "sgbm": Variant(refine_iterations=2, largest_sigma_px=math.inf, halo_lines=24),
     # The search has refined once already, at half the size.
     "coarse_to_fine": Variant(refine_iterations=1, largest_sigma_px=0.2, halo_lines=48),
@@ -92,14 +93,14 @@ class DisparityConfig(Checked):
 
     def for_width(self, width: int) -> "DisparityConfig":
         """The same for lines of ``width`` px: the matcher chosen, and its own value of every option that is None."""
-        own, matcher = VARIANTS[self.matcher], self.matcher
-        if matcher == "auto":
-            matcher = "coarse_to_fine" if width >= COARSE_TO_FINE_PX else "sgbm"
-        iterations = own.refine_iterations if own.refine_iterations is not None else VARIANTS[matcher].refine_iterations
+        matcher = self.matcher
+        if matcher == "auto" and width >= COARSE_TO_FINE_PX:
+            matcher = "coarse_to_fine"
+        own = VARIANTS[matcher]
         return replace(
             self,
-            matcher=matcher,
-            refine_iterations=iterations if self.refine_iterations is None else self.refine_iterations,
+            matcher="sgbm" if matcher == "auto" else matcher,
+            refine_iterations=own.refine_iterations if self.refine_iterations is None else self.refine_iterations,
             largest_sigma_px=own.largest_sigma_px if self.largest_sigma_px is None else self.largest_sigma_px,
             halo_lines=own.halo_lines if self.halo_lines is None else self.halo_lines,
         )
