@@ -17,7 +17,7 @@ from lsvision.schema import Text
 from lsvision.stages.correction.config import CorrectionConfig
 from lsvision.stages.correction.uncertainty import drift_per_metre
 from lsvision.stages.disparity.config import DisparityConfig
-from lsvision.types import RefusedVerdict, Verdict
+from lsvision.types import MissingLines, RefusedVerdict, Verdict
 
 log = logging.getLogger(__name__)
 
@@ -26,8 +26,9 @@ log = logging.getLogger(__name__)
 class CorrectSettings(RunSettings):
     """Options of the experiment; the product is ``<scan's name>.zarr`` in ``output``, the run's folder if None.
 
-    The formats of ``export`` are written beside it. A calibration without a usable n is refused, unless ``accept`` has
-    its verdict.
+    A scan without some of its frames or Zarr chunks is refused; with ``missing_lines`` "mark" their lines are not
+    measured. The formats of ``export`` are written beside it. A calibration without a usable n is refused, unless
+    ``accept`` has its verdict.
     """
 
     scan: Text
@@ -35,6 +36,7 @@ class CorrectSettings(RunSettings):
     disparity: DisparityConfig
     correction: CorrectionConfig
     repair_encoder: bool = False
+    missing_lines: MissingLines = "refuse"
     accept: list[RefusedVerdict] = field(default_factory=list)
     export: list[ExportFormat] = field(default_factory=list)
     output: Text | None = None
@@ -48,6 +50,7 @@ class ProductSummary:
     standard deviation of (q_x, q_y, q_z) per metre of the object, mm, that the calibration's uncertainty causes.
     ``pair`` is how the right image differed from the left one apart from disparity: lines by which it was late, of
     which whole ones were taken into account, its gain, offset and curve; None where the camera measured the depth.
+    ``missing_lines`` counts the lines of the scan that were not there.
     """
 
     path: str
@@ -61,11 +64,18 @@ class ProductSummary:
     motion_mm_per_m: tuple[float, float]
     drift_mm_per_m: tuple[float, ...]
     pair: dict[str, Any] | None
+    missing_lines: int
 
 
 def run_correct(settings: CorrectSettings, folder: Path) -> None:
     """Correct the scan with the calibration's motion and write the product."""
-    processing = Processing(settings.disparity, settings.correction, settings.repair_encoder, worker_memory_mb=None)
+    processing = Processing(
+        settings.disparity,
+        settings.correction,
+        settings.repair_encoder,
+        worker_memory_mb=None,
+        missing_lines=settings.missing_lines,
+    )
     planned = plan_one(settings.scan, settings.calibration, processing, settings.accept)
     if planned.calibration.warning:
         log.warning("%s", planned.calibration.warning)
@@ -131,4 +141,5 @@ def make_product(planned: PlannedScan, processing: Processing, output: Path, bar
         motion_mm_per_m=planned.calibration.calibration.motion.drift_mm_per_m,
         drift_mm_per_m=drift_per_metre(planned.calibration.calibration.motion),
         pair=dict(pair) if isinstance(pair, Mapping) else None,
+        missing_lines=planned.missing_lines,
     )
