@@ -88,6 +88,7 @@ def measure_block(
     if bool(missing.any()):
         mean = _mean_of(gray_left[~missing])
         gray_left, gray_right = (image.masked_fill(missing[:, None], mean) for image in (gray_left, gray_right))
+        unusable = unusable.on_lines(~missing)
     match = _measure(gray_left, gray_right, unusable, rig, config, with_gain=with_gain)
     partner = torch.arange(lines.start, lines.stop) + shift
     spoiled = missing_near(missing, config.refine_window)[lines.inner]

@@ -34,10 +34,10 @@ def rendered() -> tuple[torch.Tensor, ...]:
     return left, right, (focal_length_px(RIG) * RIG.baseline_mm / depth - offset).float()
 
 
-def lacking(image: torch.Tensor, *ranges: range, value: int = 0) -> Lacking:
+def lacking(image: torch.Tensor, *ranges: range) -> Lacking:
     image = image.clone()
     for lines in ranges:
-        image[lines.start : lines.stop] = value
+        image[lines.start : lines.stop] = torch.randint(0, 256, image[lines.start : lines.stop].shape)
     return Lacking(image, ranges)
 
 
@@ -54,8 +54,8 @@ def test_lines_beside_missing_ones_are_measured_as_well(rendered, matcher: Match
     before = measure_block(whole, relation(whole, config), RIG, config, 0)
     lost = range(70, 90)
     pair = StereoPair(
-        lacking(left, lost, value=255) if side == "left" else TensorImage(left),
-        lacking(right, lost, value=255) if side == "right" else TensorImage(right),
+        lacking(left, lost) if side == "left" else TensorImage(left),
+        lacking(right, lost) if side == "right" else TensorImage(right),
     )
     match = measure_block(pair, relation(pair, config), RIG, config, 0)
     near = slice(lost.start - config.refine_window, lost.stop + config.refine_window)
@@ -73,7 +73,19 @@ def test_bands_of_the_relation_avoid_missing_lines(rendered):
     config = DisparityConfig()
     whole = StereoPair(TensorImage(left), TensorImage(right.roll(2, dims=0)))
     lost = range(30), range(100, 160)
-    pair = StereoPair(lacking(left, lost[1], value=255), lacking(right.roll(2, dims=0), lost[0], value=255))
+    pair = StereoPair(lacking(left, lost[1]), lacking(right.roll(2, dims=0), lost[0]))
     expected, found = relation(whole, config).rows, relation(pair, config).rows
     assert found.whole == expected.whole == 2
     assert abs(found.lines - expected.lines) < 0.05
+
+
+@pytest.mark.parametrize("matcher", ["sgbm", "coarse_to_fine"])
+def test_what_missing_lines_hold_makes_no_difference(rendered, matcher: Matcher):
+    left, right, _ = rendered
+    config = DisparityConfig(matcher=matcher)
+    matches = []
+    for _ in range(2):  # each with other noise
+        pair = StereoPair(lacking(left, range(70, 90)), lacking(right, range(120, 125)))
+        matches.append(measure_block(pair, relation(pair, config), RIG, config, 0))
+    assert torch.equal(matches[0].disparity.nan_to_num(), matches[1].disparity.nan_to_num())
+    assert torch.equal(matches[0].sigma.nan_to_num(), matches[1].sigma.nan_to_num())
