@@ -17,6 +17,8 @@ from torch import Tensor
 from lsvision.schema import Checked, IntFrom2, NonNegative, Positive, PositiveInt
 
 Transport = Literal["forward", "reverse"]
+# What is done about lines of an image that are not there: the scan is refused, or goes on without them.
+MissingLines = Literal["refuse", "mark"]
 CalibrationMethod = Literal["joint", "two_step", "sequential", "least_squares"]
 # What a calibration is worth, the first that holds from the right: see ``Calibration``.
 Verdict = Literal["determined", "prior-dominated", "inconsistent", "not converged"]
@@ -103,6 +105,12 @@ class LineImage(Protocol):
         ...
 
 
+def missing_ranges(image: LineImage) -> tuple[range, ...]:
+    """Lines of an image that are not there, in order; what ``read`` gives for them means nothing."""
+    ranges: tuple[range, ...] = getattr(image, "missing", ())  # only images of several files can lack some
+    return ranges
+
+
 @dataclass(frozen=True)
 class TensorImage:
     """A ``LineImage`` of a tensor ``(lines, width, channels)`` that is in memory already."""
@@ -161,6 +169,17 @@ class Scan:
     def lines(self) -> int:
         """Number of lines of the scan."""
         return self.left.shape[0]
+
+    @property
+    def missing(self) -> Mapping[str, tuple[range, ...]]:
+        """The lines that are not there, by the name of the image; empty where none are missing."""
+        named = {name: missing_ranges(image) for name, image in vars(self.images).items()}
+        return {name: ranges for name, ranges in named.items() if ranges}
+
+    @property
+    def missing_lines(self) -> int:
+        """Number of lines that are not there in at least one image."""
+        return len({line for ranges in self.missing.values() for lines in ranges for line in lines})
 
 
 @dataclass(frozen=True)

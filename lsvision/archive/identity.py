@@ -11,6 +11,7 @@ from lsvision.errors import FileFormatError, ScanChangedError
 from lsvision.io import scan_files
 from lsvision.stages.correction.config import CorrectionConfig
 from lsvision.stages.disparity.config import DisparityConfig
+from lsvision.types import MissingLines
 
 
 @dataclass(frozen=True)
@@ -21,6 +22,7 @@ class ScanFiles:
     stamp: str
     lines: int
     repair_encoder: bool
+    missing_lines: MissingLines = "refuse"
 
     def check_unchanged(self) -> None:
         """Check that the files are those that were planned.

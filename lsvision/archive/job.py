@@ -66,6 +66,7 @@ class ScanJob:
                 path=planned.files.path,
                 status="running",
                 lines=planned.lines,
+                missing_lines=planned.missing_lines,
                 stamp=planned.files.stamp,
                 input_sha256=known.input_sha256 if known is not None and untouched else "",
                 calibration=str(planned.calibration.path),
@@ -227,7 +228,7 @@ class ScanJob:
     def _depth_key(self) -> str:
         processing, planned = self._place.processing, self.planned
         key = depth_key(self._row.input_sha256, processing.disparity, processing.with_sigma, __version__)
-        return key_of(key, planned.lines, planned.width)
+        return key_of(key, planned.lines, planned.width, processing.missing_lines)
 
     @cached_property
     def _strips_key(self) -> str:

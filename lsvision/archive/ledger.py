@@ -32,6 +32,7 @@ class ScanRow:
 
     ``stamp`` changes when its files are touched (paths, sizes, times), ``input_sha256`` when their content changes.
     ``seconds`` is the work on all its strips, ``measured_share`` the share of the product's cells with a height.
+    ``missing_lines`` counts those of ``lines`` that are not there in one of the images.
     ``verdict`` is its calibration's, empty where it is not known; ``sideways_mm_per_m`` and ``in_depth_mm_per_m`` are
     the motion that was corrected, ``drift_sigma_mm_per_m`` the largest standard deviation of a position, mm per metre.
     """
@@ -53,6 +54,7 @@ class ScanRow:
     sideways_mm_per_m: float = 0.0
     in_depth_mm_per_m: float = 0.0
     drift_sigma_mm_per_m: float = 0.0
+    missing_lines: int = 0
 
 
 @dataclass(frozen=True)
@@ -200,6 +202,8 @@ def ledger_lines(rows: Mapping[str, ScanRow]) -> Iterator[str]:
         result = (
             row.error if row.status == "failed" else f"{row.lines} lines, {100 * row.measured_share:.1f} % measured"
         )
+        if row.missing_lines and row.status != "failed":
+            result += f", {row.missing_lines} lines missing"
         known = row.verdict and row.status != "failed"
         drift = f"{row.verdict} to ±{row.drift_sigma_mm_per_m:.2g} mm/m, " if known else ""
         yield f"{key:{width}}  {row.status:7}  {row.seconds:8.1f} s  {drift}{result}"

@@ -15,7 +15,7 @@ from lsvision.stages.correction.config import CorrectionConfig
 from lsvision.stages.correction.grid import most_lines, plan_product, source_dtype
 from lsvision.stages.disparity.config import DisparityConfig
 from lsvision.stages.disparity.match import disparity_range
-from lsvision.types import ProductGrid, Scan, StereoPair
+from lsvision.types import MissingLines, ProductGrid, Scan, StereoPair
 
 # Peak of a worker over an idle one, as measured; an idle one holds torch, OpenCV and the decoded ends of its files.
 IDLE_BYTES = 500 * 2**20
@@ -33,6 +33,7 @@ class Processing:
     correction: CorrectionConfig
     repair_encoder: bool
     worker_memory_mb: int | None
+    missing_lines: MissingLines = "refuse"
 
     @property
     def with_sigma(self) -> bool:
@@ -42,7 +43,8 @@ class Processing:
     @property
     def sha256(self) -> str:
         """Hash of the options that products depend on; the height of strips of rows is not part of it."""
-        return key_of(asdict(self.disparity), options_without_strips(self.correction), self.repair_encoder)
+        options = options_without_strips(self.correction)
+        return key_of(asdict(self.disparity), options, self.repair_encoder, self.missing_lines)
 
 
 @dataclass(frozen=True)
@@ -50,7 +52,7 @@ class PlannedScan:
     """A scan that can be processed.
 
     ``matched`` says whether its depth has to be matched, ``cell_bytes`` is the size of a cell of its product, and
-    ``correction`` has the strips that fit the memory of a worker.
+    ``correction`` has the strips that fit the memory of a worker. ``missing_lines`` counts those that are not there.
     """
 
     key: str
@@ -62,6 +64,7 @@ class PlannedScan:
     calibration: DatedCalibration
     grid: ProductGrid
     correction: CorrectionConfig
+    missing_lines: int = 0
 
     @property
     def product_strips(self) -> int:
@@ -79,14 +82,14 @@ def plan_scan(found: Found, calibrations: Sequence[DatedCalibration], processing
     """
     if found.problem is not None:
         raise FileFormatError(found.path, found.problem)
-    scan = read_scan(found.path, repair_encoder=processing.repair_encoder)
+    scan = read_scan(found.path, repair_encoder=processing.repair_encoder, missing_lines=processing.missing_lines)
     stamp = stamp_of(found.path)  # of files that are known to be images: a folder of any other kind may have no end
     calibration = calibration_for(scan, calibrations)
     motion = calibration.calibration.motion
     grid, frame = plan_product(scan, motion, processing.correction), ProductFrame(scan.rig, scan.travel, motion.n)
     return PlannedScan(
         key=found.key,
-        files=ScanFiles(str(found.path), stamp, scan.lines, processing.repair_encoder),
+        files=ScanFiles(str(found.path), stamp, scan.lines, processing.repair_encoder, processing.missing_lines),
         lines=scan.lines,
         width=scan.rig.width_px,
         matched=isinstance(scan.images, StereoPair),
@@ -95,6 +98,7 @@ def plan_scan(found: Found, calibrations: Sequence[DatedCalibration], processing
         calibration=calibration,
         grid=grid,
         correction=replace(processing.correction, strip_rows=_strip_rows(scan, frame, grid, processing)),
+        missing_lines=scan.missing_lines,
     )
 
 

@@ -16,6 +16,7 @@ from lsvision.io.product.layout import ROOT_METADATA
 from lsvision.stages.correction.grid import source_dtype
 from lsvision.stages.correction.uncertainty import EncoderRepair, drift_per_metre
 from lsvision.stages.disparity.depth import relation_of_scan
+from lsvision.types import Scan
 
 log = logging.getLogger(__name__)
 
@@ -44,7 +45,11 @@ def product_layout(planned: PlannedScan, processing: Processing, input_sha256: s
     Raises:
         FileFormatError: the scan cannot be read any more.
     """
-    scan = read_scan(planned.files.path, repair_encoder=processing.repair_encoder)
+    scan = read_scan(
+        planned.files.path, repair_encoder=processing.repair_encoder, missing_lines=processing.missing_lines
+    )
+    if scan.missing:
+        log.warning("%s: %d of %d lines are missing: not measured", scan.path, scan.missing_lines, scan.lines)
     relation = relation_of_scan(scan, processing.disparity)
     if relation is not None and relation.rows.whole:
         log.warning(
@@ -77,12 +82,19 @@ def product_layout(planned: PlannedScan, processing: Processing, input_sha256: s
             "disparity": asdict(processing.disparity),
             **({"pair": relation.metadata} if relation is not None else {}),
             **({"encoder_repair": asdict(repair)} if repair is not None else {}),
+            **({"missing_lines": _missing_in(scan)} if scan.missing else {}),
             "correction": asdict(planned.correction),
             "key": key,
         },
         uncertainty=planned.correction.uncertainty,
         source_dtype=source_dtype(planned.lines),
     )
+
+
+def _missing_in(scan: Scan) -> dict[str, object]:
+    """How many lines are missing, and which, first and last, by image."""
+    lines = {name: [[part.start, part.stop - 1] for part in ranges] for name, ranges in scan.missing.items()}
+    return {"count": scan.missing_lines, **lines}
 
 
 def check_own(target: Path, planned: PlannedScan, input_sha256: str) -> None:

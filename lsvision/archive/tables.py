@@ -2,7 +2,7 @@
 
 import sqlite3
 
-VERSION = 3  # of the tables; version 1 recorded none, version 2 lacked the last columns of the scans
+VERSION = 4  # of the tables; version 1 recorded none, versions 2 and 3 lacked the last columns of the scans
 
 _TABLES = (
     """
@@ -28,6 +28,7 @@ _SINCE_VERSION_3 = (
     "in_depth_mm_per_m REAL NOT NULL DEFAULT 0.0",
     "drift_sigma_mm_per_m REAL NOT NULL DEFAULT 0.0",
 )
+_SINCE_VERSION_4 = ("missing_lines INTEGER NOT NULL DEFAULT 0",)
 
 
 def version_of(db: sqlite3.Connection) -> int:
@@ -46,7 +47,7 @@ def bring_up_to_date(db: sqlite3.Connection, version: int) -> bool:
             db.execute(table)
         dropped = bool(old)
     if version < VERSION:
-        for column in _SINCE_VERSION_3:
+        for column in (*(_SINCE_VERSION_3 if version < 3 else ()), *_SINCE_VERSION_4):
             db.execute(f"ALTER TABLE scans ADD COLUMN {column}")
         db.execute(f"PRAGMA user_version = {VERSION}")
     return dropped

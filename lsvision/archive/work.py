@@ -202,7 +202,7 @@ def _planned_files(files: ScanFiles) -> Iterator[None]:
 # Neighbouring strips of a scan share the parts of the files that were decoded last.
 @lru_cache(maxsize=2)
 def _open_scan(files: ScanFiles) -> Scan:
-    scan = read_scan(files.path, repair_encoder=files.repair_encoder)
+    scan = read_scan(files.path, repair_encoder=files.repair_encoder, missing_lines=files.missing_lines)
     if scan.lines != files.lines:
         raise ScanChangedError(files.path)
     return scan

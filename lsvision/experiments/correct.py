@@ -17,7 +17,7 @@ from lsvision.schema import Text
 from lsvision.stages.correction.config import CorrectionConfig
 from lsvision.stages.correction.uncertainty import drift_per_metre
 from lsvision.stages.disparity.config import DisparityConfig
-from lsvision.types import RefusedVerdict, Verdict
+from lsvision.types import MissingLines, RefusedVerdict, Verdict
 
 log = logging.getLogger(__name__)
 
@@ -26,8 +26,9 @@ log = logging.getLogger(__name__)
 class CorrectSettings(RunSettings):
     """Options of the experiment; the product is ``<scan's name>.zarr`` in ``output``, the run's folder if None.
 
-    The formats of ``export`` are written beside it. A calibration without a usable n is refused, unless ``accept`` has
-    its verdict.
+    A scan without some of its frames or Zarr chunks is refused; with ``missing_lines`` "mark" their lines are not
+    measured. The formats of ``export`` are written beside it. A calibration without a usable n is refused, unless
+    ``accept`` has its verdict.
     """
 
     scan: Text
@@ -35,6 +36,7 @@ class CorrectSettings(RunSettings):
     disparity: DisparityConfig
     correction: CorrectionConfig
     repair_encoder: bool = False
+    missing_lines: MissingLines = "refuse"
     accept: list[RefusedVerdict] = field(default_factory=list)
     export: list[ExportFormat] = field(default_factory=list)
     output: Text | None = None
@@ -50,6 +52,7 @@ class ProductSummary:
     which whole ones were taken into account, its gain, offset and curve; None where the camera measured the depth.
     ``encoder_repair`` has the number of lines whose travel was interpolated and the largest standard deviation of their
     travel, mm; None where none was.
+    ``missing_lines`` counts the lines of the scan that were not there.
     """
 
     path: str
@@ -64,11 +67,18 @@ class ProductSummary:
     drift_mm_per_m: tuple[float, ...]
     pair: dict[str, Any] | None
     encoder_repair: dict[str, Any] | None
+    missing_lines: int
 
 
 def run_correct(settings: CorrectSettings, folder: Path) -> None:
     """Correct the scan with the calibration's motion and write the product."""
-    processing = Processing(settings.disparity, settings.correction, settings.repair_encoder, worker_memory_mb=None)
+    processing = Processing(
+        settings.disparity,
+        settings.correction,
+        settings.repair_encoder,
+        worker_memory_mb=None,
+        missing_lines=settings.missing_lines,
+    )
     planned = plan_one(settings.scan, settings.calibration, processing, settings.accept)
     if planned.calibration.warning:
         log.warning("%s", planned.calibration.warning)
@@ -146,4 +156,5 @@ def make_product(planned: PlannedScan, processing: Processing, output: Path, bar
         drift_mm_per_m=drift_per_metre(planned.calibration.calibration.motion),
         pair=_entry(metadata, "pair"),
         encoder_repair=_entry(metadata, "encoder_repair"),
+        missing_lines=planned.missing_lines,
     )

@@ -41,7 +41,7 @@ from lsvision.report.progress import progress_bars
 from lsvision.schema import PositiveInt, Text
 from lsvision.stages.correction.config import CorrectionConfig
 from lsvision.stages.disparity.config import DisparityConfig
-from lsvision.types import RefusedVerdict
+from lsvision.types import MissingLines, RefusedVerdict
 
 log = logging.getLogger(__name__)
 
@@ -62,6 +62,7 @@ class ReprocessSettings(RunSettings):
     dry_run: bool = False
     verify: bool = False
     repair_encoder: bool = False
+    missing_lines: MissingLines = "refuse"
     accept: list[RefusedVerdict] = field(default_factory=list)
 
 
@@ -144,7 +145,11 @@ def _plan(settings: ReprocessSettings, output: Path, known: Mapping[str, ScanRow
 
 def _processing(settings: ReprocessSettings) -> Processing:
     return Processing(
-        settings.disparity, settings.correction, settings.repair_encoder, settings.engine.worker_memory_mb
+        settings.disparity,
+        settings.correction,
+        settings.repair_encoder,
+        settings.engine.worker_memory_mb,
+        settings.missing_lines,
     )
 
 

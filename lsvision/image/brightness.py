@@ -1,13 +1,15 @@
 """Brightness of colour and mono lines, on the scale of the sensor or on that of a byte."""
 
 import math
+from collections.abc import Sequence
 
 import cv2
 import torch
 from jaxtyping import Float, Shaped, UInt8
 from torch import Tensor
 
-from lsvision.types import LineImage
+from lsvision.image.missing import missing_mask
+from lsvision.types import LineImage, missing_ranges
 
 _SAMPLED_LINES = 16
 _BRIGHT_SHARE = 0.99  # of the pixels are no brighter than what counts as the brightest
@@ -58,9 +60,11 @@ def white_level(*images: LineImage) -> float:
 
 
 def sampled_lines(image: LineImage) -> Float[Tensor, "lines width channels"]:
-    """Sixteen lines at fixed places of an image, or all of a shorter one; float32 on the image's scale."""
-    lines = image.shape[0]
-    chosen = sorted({index * (lines - 1) // (_SAMPLED_LINES - 1) for index in range(_SAMPLED_LINES)})
+    """Sixteen lines at fixed places among those of an image, or all of fewer; float32 on the image's scale."""
+    present: Sequence[int] = range(image.shape[0])
+    if missing_ranges(image):
+        present = (~missing_mask(image, torch.arange(image.shape[0]))).nonzero()[:, 0].tolist()
+    chosen = sorted({present[index * (len(present) - 1) // (_SAMPLED_LINES - 1)] for index in range(_SAMPLED_LINES)})
     return torch.cat([image.read(line, line + 1).to(torch.float32) for line in chosen])
 
 

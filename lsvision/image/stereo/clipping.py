@@ -22,6 +22,11 @@ class UnusableSamples:
     left: Bool[Tensor, "lines width"] | None
     right: Bool[Tensor, "lines width"] | None
 
+    def on_lines(self, lines: Bool[Tensor, " lines"]) -> "UnusableSamples":
+        """Those of some lines."""
+        left, right = (None if image is None else image & lines[:, None] for image in (self.left, self.right))
+        return UnusableSamples(left, right)
+
     def removed_from(self, disparity: Float[Tensor, "rows columns"], block: int) -> Float[Tensor, "rows columns"]:
         """Disparity without the blocks that a sample spoils, in the left image or at the partner in the right one.
 

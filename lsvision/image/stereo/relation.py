@@ -11,11 +11,13 @@ from functools import cached_property
 
 import cv2
 import torch
-from jaxtyping import Shaped, UInt8
+import torch.nn.functional as F  # noqa: N812
+from jaxtyping import Bool, Shaped, UInt8
 from torch import Tensor
 
 from lsvision.image.brightness import gray_bytes
 from lsvision.image.levels import PairLevels
+from lsvision.image.missing import missing_mask
 from lsvision.image.stereo.exposure import Exposure, fit_exposure
 from lsvision.image.stereo.refine import RefineOptions, refine_disparity
 from lsvision.image.stereo.rows import RowOffset, Tiles, joined, row_offset
@@ -135,10 +137,13 @@ def _bands(images: StereoPair, white: float, size: int) -> list[_Band]:
     left, right = images.left, images.right
     lines, width = left.shape[:2]
     margin = min(_LARGEST_SHIFT, lines // 8)
-    height = min(max(_BAND_PX // width, _FEWEST_LINES), _MOST_LINES, lines - 2 * margin)
+    present = _present(images)
+    height = min(max(_BAND_PX // width, _FEWEST_LINES), _MOST_LINES, _longest_run(present) - 2 * margin)
     height -= height % size
     count = min(-(-lines // _LINES_PER_BAND), _MOST_BANDS)
     starts = [(2 * index + 1) * lines // (2 * count) - height // 2 for index in range(count)] if height > 0 else []
+    if starts and not bool(present.all()):
+        starts = _nearest_whole(starts, present, height, margin)
     return [
         _Band(
             gray_bytes(left.read(start, start + height), white),
@@ -148,6 +153,24 @@ def _bands(images: StereoPair, white: float, size: int) -> list[_Band]:
         )
         for start in starts
     ]
+
+
+def _present(images: StereoPair) -> Bool[Tensor, " lines"]:
+    """Which lines both images have."""
+    lines = torch.arange(images.left.shape[0])
+    return ~(missing_mask(images.left, lines) | missing_mask(images.right, lines))
+
+
+def _longest_run(present: Bool[Tensor, " lines"]) -> int:
+    """Most consecutive lines that are there."""
+    gaps = F.pad(~present, (1, 1), value=True).nonzero()[:, 0]
+    return int(gaps.diff().max()) - 1
+
+
+def _nearest_whole(starts: list[int], present: Bool[Tensor, " lines"], height: int, margin: int) -> list[int]:
+    """The nearest places to ``starts`` where a band and its margins have all their lines."""
+    whole = present.unfold(0, height + 2 * margin, 1).all(1).nonzero()[:, 0] + margin
+    return sorted({int(whole[(whole - start).abs().argmin()]) for start in starts})
 
 
 @dataclass

@@ -20,7 +20,7 @@ from lsvision.io.images.line_image import open_line_image
 from lsvision.io.images.tiff import write_line_image
 from lsvision.io.json_file import write_json
 from lsvision.schema import Checked, Positive, Says, Text
-from lsvision.types import DepthView, LineImage, Rig, Scan, StereoPair, Transport, Travel
+from lsvision.types import DepthView, LineImage, MissingLines, Rig, Scan, StereoPair, Transport, Travel
 
 ScanFormat = Literal["lsvision-scan/1"]
 SCAN_FORMAT: ScanFormat = "lsvision-scan/1"
@@ -93,12 +93,13 @@ class NewScan:
         )
 
 
-def read_scan(path: Path | str, *, repair_encoder: bool = False) -> Scan:
+def read_scan(path: Path | str, *, repair_encoder: bool = False, missing_lines: MissingLines = "refuse") -> Scan:
     """Open a scan; its images are read later, by line ranges.
 
     Args:
         path: the folder, or its ``scan.yaml``.
         repair_encoder: interpolate faulty lines of the encoder log instead of raising.
+        missing_lines: with "mark" images may lack frames or chunks, whose lines count as missing.
 
     Raises:
         FileFormatError: a file is missing, not what it should be, or does not fit the others.
@@ -110,7 +111,7 @@ def read_scan(path: Path | str, *, repair_encoder: bool = False) -> Scan:
         key: named_file(file, key, str(name)) for key in FILE_KEYS if (name := getattr(entries, key)) is not None
     }
     rig = read_rig(files["rig"])
-    images = {key: open_line_image(named) for key, named in files.items() if key in IMAGE_KEYS}
+    images = {key: open_line_image(named, missing_lines) for key, named in files.items() if key in IMAGE_KEYS}
     check_images(file, rig, images)
     left = images["left"]
     if "depth" in images:

@@ -1,6 +1,7 @@
 """Tall images as bands of whole lines, decoded one at a time and kept for the next read."""
 
 from collections import OrderedDict
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Protocol
 
@@ -55,14 +56,28 @@ def even_edges(lines: int, band_lines: int) -> NDArray[np.int64]:
     return np.append(np.arange(0, lines, band_lines, dtype=np.int64), lines)
 
 
+def _joined(ranges: Iterable[range]) -> tuple[range, ...]:
+    """Ranges in order, those that touch as one."""
+    joined: list[range] = []
+    for lines in ranges:
+        if joined and joined[-1].stop >= lines.start:
+            joined[-1] = range(joined[-1].start, lines.stop)
+        else:
+            joined.append(lines)
+    return tuple(joined)
+
+
 class BandedImage:
     """A ``LineImage`` on bands; an alpha channel is dropped. It is pickled as its path and opened there again.
 
+    Args:
+        missing: lines that are not there, in order.
+
     Raises:
-        FileFormatError: the image is empty, or has channels or a dtype that no camera delivers.
+        FileFormatError: the image is empty, lacks all its lines, or has channels or a dtype that no camera delivers.
     """
 
-    def __init__(self, bands: Bands) -> None:
+    def __init__(self, bands: Bands, missing: Iterable[range] = ()) -> None:
         lines, width, channels = bands.layout
         if lines < 1 or width < 1:
             raise FileFormatError(bands.path, f"expected an image, got {lines} lines of {width} px")
@@ -74,11 +89,14 @@ class BandedImage:
         size = most * width * channels * bands.dtype.itemsize
         check_band_bytes(bands.path, f"one of {most} lines of {width} px", size)
         self._bands = bands
+        self.missing = _joined(missing)
+        if sum(map(len, self.missing)) == lines:
+            raise FileFormatError(bands.path, f"all {lines} lines are missing")
         self._shape = (lines, width, min(channels, 3))
         self._cache: OrderedDict[int, NDArray] = OrderedDict()
 
-    def __reduce__(self) -> tuple[type, tuple[Bands]]:
-        return type(self), (self._bands,)
+    def __reduce__(self) -> tuple[type, tuple[Bands, tuple[range, ...]]]:
+        return type(self), (self._bands, self.missing)
 
     @property
     def shape(self) -> tuple[int, int, int]:

@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lsvision.errors import FileFormatError
-from lsvision.types import LineImage
+from lsvision.types import LineImage, missing_ranges
 
 # Times the depth of zero disparity. Whatever lies beyond is a code for "no data", an infinity or a fault of the sensor.
 _NEAREST, _FARTHEST = 0.2, 5.0
@@ -39,6 +39,11 @@ class PlausibleDepth:
     def dtype(self) -> torch.dtype:
         """That of the stored map."""
         return self.stored.dtype
+
+    @property
+    def missing(self) -> tuple[range, ...]:
+        """Lines of the stored map that are not there."""
+        return missing_ranges(self.stored)
 
     def read(self, start: int, stop: int) -> Tensor:
         """Lines ``start..stop-1`` as a tensor ``(stop - start, width, 1)``."""

@@ -13,6 +13,7 @@ from PIL.PngImagePlugin import PngImageFile
 from lsvision.errors import FileFormatError
 from lsvision.io.images.bands import BandedImage, check_band_bytes
 from lsvision.io.images.tiff import TiffBands
+from lsvision.types import MissingLines
 
 FRAME_SUFFIXES = (".png", ".bmp", ".tif", ".tiff")
 # Of images that are no frames; one among frames may stand for a frame that is not there.
@@ -28,36 +29,50 @@ class FrameBands:
 
     Opening the folder decodes its first frame and reads the headers of all.
 
+    Args:
+        missing_lines: with "mark" missing frames count as lines that are not there, where their numbers and heights
+            say how many; one before the first frame or behind the last cannot be noticed.
+
     Raises:
         FileFormatError: no frames, a damaged or a missing one, or frames of different kind or width.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, missing_lines: MissingLines = "refuse") -> None:
         self.path = path
         frames = [file for file in path.iterdir() if file.suffix.lower() in FRAME_SUFFIXES and file.name[0] != "."]
         if not frames:
             raise FileFormatError(path, f"expected a Zarr array, or frames that end in {', '.join(FRAME_SUFFIXES)}")
-        self._frames = sorted(frames, key=_natural)
-        _check_kinds(path, self._frames)
-        sizes = [_frame_size(frame) for frame in self._frames]
-        for frame, (lines, width) in zip(self._frames, sizes, strict=True):
-            if width != sizes[0][1]:
-                raise FileFormatError(
-                    frame, f"expected {sizes[0][1]} columns as {self._frames[0].name} has, got {width}"
-                )
-            check_band_bytes(frame, f"one of {lines} lines", lines * width)
-        first = _decode_frame(self._frames[0])
-        self.edges = np.cumsum([0, *(lines for lines, _ in sizes)], dtype=np.int64)
-        _check_sequence(path, self._frames, self.edges[:-1])
+        frames = sorted(frames, key=_natural)
+        _check_kinds(path, frames)
+        heights = _frame_heights(frames)
+        first = _decode_frame(frames[0])
+        lost = _lost_before(path, frames, heights, missing_lines)
+        self._missing_lines = missing_lines
+        self._frames: list[Path | None] = []
+        for frame, count in zip(frames, lost, strict=True):
+            self._frames += [*([None] * count), frame]
+        all_heights = np.full(len(self._frames), heights[0])
+        all_heights[[frame is not None for frame in self._frames]] = heights
+        self.edges = np.append(0, np.cumsum(all_heights, dtype=np.int64))
         self.layout = (int(self.edges[-1]), first.shape[1], first.shape[2])
         self.dtype = first.dtype
 
-    def __reduce__(self) -> tuple[type, tuple[Path]]:
-        return type(self), (self.path,)
+    def __reduce__(self) -> tuple[type, tuple[Path, MissingLines]]:
+        return type(self), (self.path, self._missing_lines)
+
+    @property
+    def missing(self) -> list[range]:
+        """Lines of the missing frames."""
+        edges = self.edges.tolist()
+        return [range(edges[i], edges[i + 1]) for i, frame in enumerate(self._frames) if frame is None]
 
     def decode(self, band: int) -> NDArray:
-        """The lines of one frame, (lines, width, channels)."""
-        return _decode_frame(self._frames[band])
+        """The lines of one frame, (lines, width, channels); of a missing one black, or NaN."""
+        frame = self._frames[band]
+        if frame is not None:
+            return _decode_frame(frame)
+        lines = int(self.edges[band + 1] - self.edges[band])
+        return np.full((lines, *self.layout[1:]), np.nan if self.dtype.kind == "f" else 0, self.dtype)
 
 
 def _natural(file: Path) -> list[tuple[int, str]]:
@@ -73,26 +88,63 @@ def _check_kinds(folder: Path, frames: list[Path]) -> None:
             raise FileFormatError(file, f"expected frames of one kind only, as {frames[0].name} is")
 
 
-def _check_sequence(folder: Path, frames: list[Path], first_lines: NDArray[np.int64]) -> None:
-    """Check that frames are numbered one by one, or by their first lines: a lost one would move all behind it.
+def _frame_heights(frames: list[Path]) -> NDArray[np.int64]:
+    """Lines of each frame, which must all be of one width."""
+    sizes = [_frame_size(frame) for frame in frames]
+    for frame, (lines, width) in zip(frames, sizes, strict=True):
+        if width != sizes[0][1]:
+            raise FileFormatError(frame, f"expected {sizes[0][1]} columns as {frames[0].name} has, got {width}")
+        check_band_bytes(frame, f"one of {lines} lines", lines * width)
+    return np.array([lines for lines, _ in sizes], dtype=np.int64)
 
-    Names may hold further numbers, as a time, if one of them counts.
+
+def _lost_before(
+    folder: Path, frames: list[Path], heights: NDArray[np.int64], missing_lines: MissingLines
+) -> list[int]:
+    """How many frames are missing before each; in frames that are numbered without a gap, none.
+
+    Frames are numbered one by one, or by their first lines. Names may hold further numbers, as a time, if one of them
+    counts.
+
+    Raises:
+        FileFormatError: frames are missing and may not be, for all behind one would move, or it is unclear how many.
     """
+    numbers = _numbers_with_gaps(folder, frames, heights[:-1])
+    if numbers is None:
+        return [0] * len(frames)
+    if missing_lines == "refuse" or len(set(numbers)) < len(numbers):
+        raise _gaps_error(folder, frames, numbers)
+    if (heights[:-1] != heights[0]).any() or heights[-1] > heights[0]:
+        raise FileFormatError(folder, "frames are missing, and those that are there differ in height")
+    steps, height = np.diff(numbers), int(heights[0])
+    lost: list[int] = (steps // height if (steps % height == 0).all() else steps).tolist()
+    lost = [step - 1 for step in lost]
+    if sum(lost) > len(frames):
+        raise FileFormatError(folder, f"{sum(lost)} frames are missing, more than the {len(frames)} that are there")
+    return [0, *lost]
+
+
+def _numbers_with_gaps(folder: Path, frames: list[Path], heights: NDArray[np.int64]) -> NDArray | None:
+    """The number by which frames of these heights, and a last one, are counted; None where they count without a gap."""
     if len(frames) == 1:
-        return
+        return None
     if len({re.sub(r"\d+", "#", frame.stem) for frame in frames}) > 1:
         raise FileFormatError(folder, f"expected frames whose names differ in a number only, as {frames[0].name}")
     columns = np.array([[int(number) for number in re.findall(r"\d+", frame.stem)] for frame in frames], dtype=object).T
     steps = [np.diff(column) for column in columns]
-    if any((step == 1).all() or (step == np.diff(first_lines)).all() for step in steps):
-        return
+    if any((step == 1).all() or (step == heights).all() for step in steps):
+        return None
     varying = [column for column, step in zip(columns, steps, strict=True) if (step != 0).any()]
     if len(varying) != 1:
         raise FileFormatError(folder, f"expected frames that are numbered one by one, as {frames[0].name}")
-    gaps = [(low + 1, high - 1) for low, high in pairwise(varying[0].tolist()) if high != low + 1]
+    return varying[0]
+
+
+def _gaps_error(folder: Path, frames: list[Path], numbers: NDArray) -> FileFormatError:
+    gaps = [(low + 1, high - 1) for low, high in pairwise(numbers.tolist()) if high != low + 1]
     shown = ", ".join(str(low) if low == high else f"{low}-{high}" for low, high in gaps[:5] if low <= high)
     problem = f"frames {shown} are missing" if shown else "frames with equal numbers"
-    raise FileFormatError(
+    return FileFormatError(
         folder, f"{problem}{', ...' if len(gaps) > 5 else ''} ({frames[0].name} to {frames[-1].name})"
     )
 

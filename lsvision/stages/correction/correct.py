@@ -14,13 +14,13 @@ from torch import Tensor
 from lsvision.geometry import ProductFrame, depth_sigma, depth_step_mm, zero_disparity_mm
 from lsvision.image.resampling import SAMPLED_TILES
 from lsvision.image.tiling import TILE, in_parallel, tiles
-from lsvision.stages.correction.color_lines import ColorLines, color_lines, sampling_for
+from lsvision.stages.correction.color_lines import ColorLines, color_lines, lines_without_colors, sampling_for
 from lsvision.stages.correction.config import CorrectionConfig
 from lsvision.stages.correction.grid import plan_product, source_dtype
-from lsvision.stages.correction.locate import Locator, SeenCells
-from lsvision.stages.correction.profiles import ProfileReader, ProfileRule
+from lsvision.stages.correction.locate import Locator, SeenCells, cell_spacing
+from lsvision.stages.correction.profiles import DepthWithoutLines, ProfileReader, ProfileRule
 from lsvision.stages.correction.uncertainty import position_sigma
-from lsvision.types import DepthSource, Motion, ProductGrid, ProductStrip, Scan
+from lsvision.types import DepthSource, Motion, ProductGrid, ProductStrip, Scan, missing_ranges
 
 # Lines under a tile, of the 8192 over which ``PIXEL_PARTS`` are exact: slope and relief of the object add to them.
 _TILE_LINES = 4096
@@ -67,7 +67,7 @@ class Correction:
             largest_step_mm=depth_step_mm(self.scan.rig, self.config.step_px),
             bridge_px=self.config.bridge_px,
         )
-        profiles = ProfileReader(self.depth, self.frame, rule, with_sigma=self.config.uncertainty)
+        profiles = ProfileReader(self._shown_depth, self.frame, rule, with_sigma=self.config.uncertainty)
         return Locator(self.frame, self.grid, self.config, profiles)
 
     def strip(self, rows: tuple[int, int]) -> ProductStrip:
@@ -93,6 +93,14 @@ class Correction:
         size = min(TILE[0], max(1, int(_TILE_LINES / self.locator.spacing[0]))), TILE[1]
         in_parallel(fill_tile, tiles(rows[1] - rows[0], self.grid.columns, size))
         return strip
+
+    @property
+    def _shown_depth(self) -> DepthSource:
+        """The depth without the lines whose colours would come from missing lines of the image."""
+        if not missing_ranges(self.scan.left):
+            return self.depth
+        sampling = sampling_for(self.config, cell_spacing(self.frame, self.grid))
+        return DepthWithoutLines(self.depth, lines_without_colors(self.scan, self.frame, sampling))
 
     def _sample_colors(self, colors: ColorLines, image: Tensor, seen: SeenCells, out: Tensor) -> None:
         for part in tiles(len(out), out.shape[1], SAMPLED_TILES[self.config.resampler]):

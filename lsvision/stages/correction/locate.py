@@ -45,6 +45,11 @@ class SeenCells:
         return SeenCells(self.first_line, self.line[at], self.column[at], self.relief[at], self.measured[at], sigma)
 
 
+def cell_spacing(frame: ProductFrame, grid: ProductGrid) -> tuple[float, float]:
+    """Distance of neighbouring cells in the scan, in lines and in columns."""
+    return grid.pitch_mm / frame.advance_mm, grid.pitch_mm / object_pitch_mm(frame.rig)
+
+
 @dataclass(frozen=True)
 class LineRange:
     """Consecutive scan lines from ``start`` on, and how far along the motion each lies, mm."""
@@ -80,7 +85,7 @@ class Locator:
     @property
     def spacing(self) -> tuple[float, float]:
         """Distance of neighbouring cells in the scan, in lines and in columns."""
-        return self.grid.pitch_mm / self.frame.advance_mm, self.grid.pitch_mm / object_pitch_mm(self.frame.rig)
+        return cell_spacing(self.frame, self.grid)
 
     def lines_of(self, rows: tuple[int, int], scan_lines: int) -> LineRange:
         """The scan lines that rows ``rows[0]..rows[1]-1`` of the product can come from, with some to spare."""

@@ -6,6 +6,7 @@ q_x and q_z of a sample depend on its own line alone, so this needs no travel, a
 from dataclasses import dataclass, field
 
 import torch
+from jaxtyping import Bool
 from torch import Tensor
 
 from lsvision.geometry import ProductFrame, zero_disparity_mm
@@ -60,6 +61,24 @@ def resolve_profiles(depth: Depth, frame: ProductFrame, rule: ProfileRule) -> Se
         measured=measured[:, 1:] & measured[:, :-1],
     )
     return see_cells(surface, rule.columns, dim=1)
+
+
+@dataclass(frozen=True)
+class DepthWithoutLines:
+    """A depth of which some lines count as not measured: those that ``without``, ``(lines,)``, marks."""
+
+    depth: DepthSource
+    without: Bool[Tensor, " lines"]
+
+    @property
+    def lines(self) -> int:
+        """Number of lines of the scan."""
+        return self.depth.lines
+
+    def read(self, start: int, stop: int) -> Depth:
+        """Depth of lines ``start..stop-1``."""
+        depth = self.depth.read(start, stop)
+        return Depth(depth.z.masked_fill(self.without[start:stop, None], torch.nan), depth.sigma)
 
 
 @dataclass

@@ -8,6 +8,7 @@ from torch import Tensor
 
 from lsvision.geometry import disparity_at_height
 from lsvision.image.brightness import gray, gray_bytes
+from lsvision.image.missing import missing_mask, missing_near
 from lsvision.image.stereo.agreement import occluded
 from lsvision.image.stereo.blocks import block_side, enlarged, repeated
 from lsvision.image.stereo.clipping import UnusableSamples, holes_factor
@@ -83,11 +84,17 @@ def measure_block(
     unusable = UnusableSamples(levels.left.unusable(left), levels.right.unusable(right))
     gray_left, gray_right = _gray(left, levels.white), relation.as_bright_as_left(_gray(right, levels.white))
     with_gain = relation.exposure is not None or config.matcher == "sgbm"
+    missing = _missing(pair, lines, shift)  # blank in both images, they fit any disparity alike
+    if bool(missing.any()):
+        mean = _mean_of(gray_left[~missing])
+        gray_left, gray_right = (image.masked_fill(missing[:, None], mean) for image in (gray_left, gray_right))
+        unusable = unusable.on_lines(~missing)
     match = _measure(gray_left, gray_right, unusable, rig, config, with_gain=with_gain)
     partner = torch.arange(lines.start, lines.stop) + shift
+    spoiled = missing_near(missing, config.refine_window)[lines.inner]
     disparity, sigma = (values[lines.inner] for values in (match.disparity, match.sigma))
     for values in (disparity, sigma):
-        values[(partner < 0) | (partner >= pair.right.shape[0])] = torch.nan
+        values[(partner < 0) | (partner >= pair.right.shape[0]) | spoiled] = torch.nan
     return StripMatch(disparity, sigma)
 
 
@@ -100,6 +107,17 @@ def _read_shifted(image: LineImage, lines: HaloRange, shift: int) -> Tensor:
         return values
     wanted = torch.arange(lines.outer_start, lines.outer_stop) + shift
     return values[wanted.clamp(start, stop) - start]
+
+
+def _missing(pair: StereoPair, lines: HaloRange, shift: int) -> Tensor:
+    """Lines that one of the images lacks, of a range and its halo."""
+    own = torch.arange(lines.outer_start, lines.outer_stop)
+    return missing_mask(pair.left, own) | missing_mask(pair.right, own + shift)
+
+
+def _mean_of(values: Tensor) -> int:
+    """Mean grey value, whole; 0 of none."""
+    return round(float(values.float().mean())) if values.numel() else 0
 
 
 def _gray(image: Tensor, white: float) -> Tensor:
