@@ -55,3 +55,13 @@ def test_equal_images_have_no_exposure(matched):
     right[::10] += 60  # gloss that one camera sees
     assert fit_exposure(left, right, position) is None
     assert fit_exposure(left[:300], 0.5 * right[:300], position[:300]) is None  # too few to know
+
+
+def test_a_gloss_on_an_object_of_one_brightness_is_no_tone_curve():
+    """Only one camera sees it: no camera has the steep curve that would explain it."""
+    position = torch.rand(PIXELS)
+    left = 60 + 6 * torch.randn(PIXELS)
+    right = (left + 0.3 * torch.randn(PIXELS) + 120 * torch.exp(-(((position - 0.5) / 0.15) ** 2))).clamp(0, 255)
+    exposure = fit_exposure(left, right, position)
+    assert exposure is None or exposure.is_plausible
+    assert not Exposure(torch.tensor([0.2, -0.04], dtype=torch.float64), 39.7, 8.8).is_plausible

@@ -225,6 +225,7 @@ def test_sequential_lets_n_drift_unless_the_options_say_otherwise():
     assert (own_sigma > fixed_sigma).all()
 
 
+@pytest.mark.slow
 def test_sequential_knows_how_well_it_follows_an_n_that_drifts():
     corners, n_end = drifting(thinned(simulate(THREE_TILTS[:2], batch=(100,))), process_sigma=2e-5)
     followed = batch_of(corners, CalibrationConfig(method="sequential", process_sigma=2e-5))

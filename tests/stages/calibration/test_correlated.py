@@ -200,6 +200,7 @@ def test_a_batch_gives_the_bits_of_its_problems_alone():
     assert torch.equal(together.covariance[1], alone.covariance[0])
 
 
+@pytest.mark.slow
 def test_all_methods_allow_for_the_same_errors():
     torch.manual_seed(6)
     corners = shaken(simulate(), 0.05, 300.0)

@@ -95,6 +95,7 @@ def test_an_exact_size_costs_nothing_and_an_unknown_one_a_quarter_of_a_sigma_of_
     assert ((ratio > 1) & (ratio < torch.tensor([1.01, 1.3, 1.01]))).all()
 
 
+@pytest.mark.slow
 def test_contradicting_scans_widen_the_sigmas_of_n():
     """n3 of one scan off by 0.01 hardly raises the chi-square of all corners, but moves n by many sigmas."""
     corners = drifting_last(THREE, (0.0, 0.0, 0.01), 50)

@@ -144,6 +144,7 @@ def test_a_size_within_its_stated_sigma_is_no_contradiction():
     assert share(larger, assumed=Assumed(0.05, 1e-3))[0] == 1.0
 
 
+@pytest.mark.slow
 def test_departures_come_out_with_their_sigmas():
     torch.manual_seed(9)
     reduced, start = posed(faster(THREE, (1.00, 1.03, 1.06), 200))

@@ -40,7 +40,9 @@ def shadow(image: Tensor, corner: Tensor) -> Tensor:
     return torch.where(u > 0.1, 0.35 * image, image)
 
 
-@pytest.mark.parametrize("in_both", [True, False], ids=["both", "one"])
+@pytest.mark.parametrize(
+    "in_both", [pytest.param(True, marks=pytest.mark.slow, id="both"), pytest.param(False, id="one")]
+)
 @pytest.mark.parametrize("spoil", [clamp, finger, glare, shadow])
 def test_what_is_left_is_right(spoil, in_both):
     source = simulation(SceneConfig(pitch_deg=5.0, roll_deg=-4.0, yaw_deg=14.0))
