@@ -60,7 +60,7 @@ def _corners(image: np.ndarray) -> np.ndarray:
 def test_sigma_is_that_of_the_errors_on_boards(boards):
     """The squares have no texture: most of what is measured lies beside their edges.
 
-    Sigma covers what a step of the surface would do there, which a flat board does not have: errors are about half of it.
+    Sigma covers what a step of the surface would do there; a flat board has none, and errors are about half of it.
     """
     rig, views = boards
     errors, sigmas = [], []
