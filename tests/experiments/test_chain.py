@@ -82,6 +82,7 @@ def test_calibrate_finds_the_motion_and_correct_makes_the_board_square(scans, co
     assert summary["pair"]["right_gain"] == [1.0, 1.0]
 
 
+@pytest.mark.slow
 def test_cameras_out_of_step_are_said(scans, command, tmp_path, capsys):
     shutil.copytree(scans / "b", tmp_path / "late")
     scan = read_scan(scans / "b")

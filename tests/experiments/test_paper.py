@@ -36,6 +36,7 @@ def test_the_paper_at_a_quarter_of_the_pixels(command, tmp_path):
     assert not list(tmp_path.rglob("*.partial"))
 
 
+@pytest.mark.slow
 def test_the_paper_at_a_tenth_of_the_pixels(command, tmp_path):
     assert command("+experiment=paper", "scale=10", "vibrating.seed=100") == 0
     _check(json.loads((tmp_path / "run" / "summary.json").read_text()), sheet_px=1.0)

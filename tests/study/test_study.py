@@ -201,6 +201,7 @@ def test_wrong_conditions_are_named(rig):
         noise_chol(dataclasses.replace(POINT, depth_sigma_mm=0.0))
 
 
+@pytest.mark.slow
 def test_study_of_a_vibration_shows_by_wavelength_whether_sigma_covers_it(command, tmp_path):
     axes = ("axes.boards=null", "axes.vibration_wavelength_mm=[97.0,480.0]", "conditions.vibration_mm=0.1")
     assert command("+experiment=study", *axes, "runs=2", "map_steps=2") == 0
