@@ -20,8 +20,8 @@ _DEPTHS = (10, 12, 14, 16)  # bits of sensors whose images have sixteen
 _HOT_SHARE = 2e-4  # of the samples may lie above a plateau: hot pixels
 _PLATEAU_SHARE, _PLATEAU_RISE, _PLATEAU_BELOW = 1e-3, 2.0, 3  # of the samples; over the most frequent code just below
 _GROUP = 16  # neighbouring columns tell how one of them should vary
-# Of the usual range along the scan, which is 3 codes at least. A column is stuck where both its neighbours are lively:
-# at the rim of a dark stretch ranges change from column to column.
+# Shares of the usual range along the scan, which must be at least 3 codes. A column counts as stuck only where the
+# columns on both sides vary: at the edge of a dark area the range changes from column to column.
 _STUCK, _LIVELY, _LEAST_RANGE = 0.1, 0.5, 3.0
 _WILD, _LEAST_DIFFERENCE = 8.0, 0.02  # times the usual difference from a neighbour; of white
 

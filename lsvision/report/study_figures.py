@@ -37,7 +37,7 @@ AXIS_LABELS = {
     "board_count": "boards scanned [count]",
     "tilt_spread_deg": "largest angle between two boards [deg]",
 }
-# Conditions that the calibration is not told of, and that it has to notice.
+# Conditions that the calibration does not know and has to detect.
 DISTURBANCES = ("vibration_mm", "vibration_wavelength_mm", "encoder_mm", "encoder_wavelength_mm")
 _COMPONENTS = ("n1, sideways", "n2, along", "n3, in depth")
 _FEW_STEPS = 8  # iterations over which the contraction of a slow method is averaged

@@ -27,8 +27,8 @@ class Conditions(Checked):
     """One point of a study: the boards' placing, the installation, disturbances of the corners, and the method for n.
 
     ``corner_sigma_mm`` is the white noise of x and of the travel, ``depth_sigma_mm`` that of z; the calibration knows
-    both. It is not told of the vibration of x and z and of the encoder's error: sine waves of a given rms, with other
-    phases in every scan, which it has to notice.
+    both. It does not know the vibration of x and z or the encoder's error, and has to detect them: sine waves of a
+    given rms, with new phases in every scan.
     """
 
     boards: Text

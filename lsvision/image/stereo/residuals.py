@@ -7,8 +7,8 @@ import torch.nn.functional as F  # noqa: N812
 from jaxtyping import Float
 from torch import Tensor
 
-_TILE, _STEP = 64, 8  # px, of which every eighth along either side tells the noise
-_ENOUGH = 0.5  # of a tile must have a match to tell its noise
+_TILE, _STEP = 64, 8  # px; the noise is estimated from every eighth pixel in both directions
+_ENOUGH = 0.5  # share of a tile that must be matched before its noise is estimated
 _DISTURBED = 24.0  # times the usual variance
 
 

@@ -55,6 +55,7 @@ def candidates(boards: int, curved: bool, like: Tensor) -> list[Candidate]:
     """The causes that are compared: of all scans alike, of all scans apart, and of each scan alone."""
 
     def pattern(kind: str, scan: int) -> Tensor:
+        """A departure of every scan on its own, or that of one scan: ``(boards, kinds, 1 or boards)``."""
         empty = like.new_zeros(boards, len(KINDS), boards)
         for board in range(boards):
             empty[board, KINDS.index(kind), board] = 1.0

@@ -27,7 +27,7 @@ _GROWTH = 1.6  # of the cost's robustness, by step
 _REFITS = 4
 _CLEARLY = 0.25  # scale of another start's residuals that shows the first one to have failed
 _MIDDLE = 0.75  # of a board's half lengths
-_NEIGHBOURS = 11  # corners before and after one, with it, that tell how far its line is displaced
+_NEIGHBOURS = 11  # consecutive corners, centred on one, from which the displacement of its line is estimated
 _SHARED = 0.25  # of a corner's squared distance at most is its own, where its line is displaced
 _LITTLE = 0.01  # of the board's span, that lines may be displaced by: a tenth of a square of ours
 # A board's residuals are looked into where as large ones have less than this probability.

@@ -1,0 +1,74 @@
+"""The frozen dataclasses that flow between the stages: the vocabulary that all packages share.
+
+Units are millimetres, pixels and lines; angles are radians unless a name ends in ``_deg``. Pixel centres are integers.
+Leading batch dimensions are written ``*batch``. Frames are those of the README's convention table: scan frame S, board
+frame C, product frame M.
+"""
+
+from lsvision.types.calibration import (
+    BoardCorners,
+    BoardFit,
+    Calibration,
+    CalibrationMethod,
+    ErrorAlongScan,
+    Iteration,
+    Motion,
+    Observability,
+    ObservedDirection,
+    Pose,
+    Provenance,
+    RefusedVerdict,
+    Verdict,
+)
+from lsvision.types.product import (
+    ProductGrid,
+    ProductStrip,
+)
+from lsvision.types.scan import (
+    Board,
+    Depth,
+    DepthSource,
+    DepthView,
+    LineImage,
+    MissingLines,
+    Rig,
+    Scan,
+    StereoPair,
+    StoredDepth,
+    TensorImage,
+    Transport,
+    Travel,
+    missing_ranges,
+)
+
+__all__ = [
+    "Board",
+    "BoardCorners",
+    "BoardFit",
+    "Calibration",
+    "CalibrationMethod",
+    "Depth",
+    "DepthSource",
+    "DepthView",
+    "ErrorAlongScan",
+    "Iteration",
+    "LineImage",
+    "MissingLines",
+    "Motion",
+    "Observability",
+    "ObservedDirection",
+    "Pose",
+    "ProductGrid",
+    "ProductStrip",
+    "Provenance",
+    "RefusedVerdict",
+    "Rig",
+    "Scan",
+    "StereoPair",
+    "StoredDepth",
+    "TensorImage",
+    "Transport",
+    "Travel",
+    "Verdict",
+    "missing_ranges",
+]

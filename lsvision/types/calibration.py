@@ -1,0 +1,183 @@
+"""What a calibration starts from and comes to: corners, motion, poses, verdict."""
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from lsvision.schema import NonNegative, Positive
+from lsvision.types.scan import Rig
+
+CalibrationMethod = Literal["joint", "two_step", "sequential", "least_squares"]
+# What a calibration is worth, the first that holds from the right: see ``Calibration``.
+Verdict = Literal["determined", "prior-dominated", "inconsistent", "not converged"]
+# Verdicts without a usable n, as an option names them that uses one all the same.
+RefusedVerdict = Literal["inconsistent", "not_converged"]
+
+
+@dataclass(frozen=True)
+class Pose:
+    """Where the frame of a target stands: ``p = rotation p_frame + translation``, mm."""
+
+    rotation: Float[Tensor, "*batch 3 3"]
+    translation: Float[Tensor, "*batch 3"]
+
+
+@dataclass(frozen=True)
+class BoardCorners:
+    """The corners of one board in one scan, measured and true.
+
+    ``points`` are the measured ``(x, travel, z)`` of every corner in the order of ``board_points``; ``covariance`` is
+    theirs, mm². A corner with ``valid`` false was not seen; its point is NaN.
+    """
+
+    scan: str
+    points: Float[Tensor, "corners 3"]
+    covariance: Float[Tensor, "corners 3 3"]
+    valid: Bool[Tensor, " corners"]
+    board_points: Float[Tensor, "corners 3"]
+    left_px: Float[Tensor, "corners 2"]
+    right_px: Float[Tensor, "corners 2"] | None = None
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Displacement ``n`` of the object in mm per nominal mm of travel, and how well it is known."""
+
+    n: Float[Tensor, "3"]
+    covariance: Float[Tensor, "3 3"]
+
+    @property
+    def stretch(self) -> float:
+        """Length of n: true over nominal travel."""
+        return float(torch.linalg.vector_norm(self.n))
+
+    @property
+    def sigma(self) -> Float[Tensor, "3"]:
+        """Standard deviation of each component of n."""
+        return self.covariance.diagonal(dim1=-2, dim2=-1).sqrt()
+
+    @property
+    def drift_mm_per_m(self) -> tuple[float, float]:
+        """How far the object moves sideways (X) and in depth (Z) per metre along Y, mm."""
+        n1, n2, n3 = self.n.tolist()
+        return 1000.0 * n1 / n2, 1000.0 * n3 / n2
+
+
+@dataclass(frozen=True)
+class Iteration:
+    """State of a calibration after one iteration."""
+
+    rmse_mm: NonNegative
+    n: tuple[float, float, float]
+    stretch: Positive
+
+
+@dataclass(frozen=True)
+class BoardFit:
+    """Pose of one board in the scan frame, and its residuals before and after calibration.
+
+    ``corners`` is how many were used. ``reduced_chi_square`` compares their residuals after with their given
+    covariance: 1 where they are as expected; ``largest_residual`` is that of one corner, in sigmas; None where they are
+    not known. ``outliers`` are the corners left out, as (column, row) from 1 at the board's origin.
+    """
+
+    scan: str
+    corners: int
+    pose: Pose
+    rmse_before_mm: float
+    rmse_after_mm: float
+    reduced_chi_square: float | None = None
+    outliers: tuple[tuple[int, int], ...] = ()
+    largest_residual: float | None = None
+
+
+@dataclass(frozen=True)
+class ErrorAlongScan:
+    """An error that all corners of a line share, as of vibration or of the encoder, in one component of their points.
+
+    ``length_mm`` is that of a wave along the travel whose correlation falls as fast.
+    """
+
+    component: Literal["x", "travel", "z"]
+    rms_mm: Positive
+    length_mm: Positive
+
+    @property
+    def in_words(self) -> str:
+        """What it is, for a reader."""
+        where = {"x": "sideways", "travel": "in the travel", "z": "in depth"}[self.component]
+        return f"errors along the scan: {self.rms_mm:.2g} mm rms {where}, about {self.length_mm:.2g} mm long"
+
+
+@dataclass(frozen=True)
+class ObservedDirection:
+    """A direction of n and how much the data narrowed the prior along it."""
+
+    vector: tuple[float, float, float]
+    prior_sigma: Positive
+    posterior_sigma: NonNegative
+    observed: bool
+
+
+@dataclass(frozen=True)
+class Observability:
+    """Whether the boards determine n, direction by direction, and what to scan next."""
+
+    directions: tuple[ObservedDirection, ...]
+    advice: str
+
+    @property
+    def determined(self) -> bool:
+        """Whether the boards show every direction."""
+        return all(direction.observed for direction in self.directions)
+
+
+@dataclass(frozen=True)
+class Provenance:
+    """What a calibration was made from: version, configuration and the scans with their hashes."""
+
+    version: str
+    config_sha256: str
+    scans: tuple[tuple[str, str], ...] = ()
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """The motion of an object under a rig, measured on one or more boards.
+
+    The verdict is ``not converged`` where the estimate did not settle; else ``inconsistent`` where the boards
+    contradict each other, what was said of them, or the model; else ``prior-dominated`` where they leave a direction of
+    n to the prior; else ``determined``. ``reasons`` are the sentences that say why it is not ``determined``,
+    ``notes`` what else was noticed and allowed for.
+    ``noise_scale`` is how many times larger than the corners' given covariance their residuals are, 1 where they are as
+    expected; the covariance of n allows for it, and for the ``errors_along_scan`` that the residuals show.
+    """
+
+    method: CalibrationMethod
+    motion: Motion
+    rmse_before_mm: float
+    rmse_after_mm: float
+    iterations: tuple[Iteration, ...]
+    boards: tuple[BoardFit, ...]
+    observability: Observability
+    rig: Rig
+    verdict: Verdict = "determined"
+    reasons: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
+    converged: bool = True
+    noise_scale: float = 1.0
+    errors_along_scan: tuple[ErrorAlongScan, ...] = ()
+    provenance: Provenance = field(default_factory=lambda: Provenance("", ""))
+
+    @property
+    def improvement(self) -> float:
+        """Share of the RMSE that the calibration removed, 1 - after / before."""
+        return 1.0 - self.rmse_after_mm / self.rmse_before_mm
+
+    @property
+    def usable(self) -> bool:
+        """Whether its n may correct scans: the verdict is ``determined`` or ``prior-dominated``."""
+        return self.verdict in ("determined", "prior-dominated")
