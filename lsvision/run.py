@@ -6,6 +6,7 @@
 import logging
 import os
 import sys
+import warnings
 from functools import partial
 from pathlib import Path
 from typing import Any, cast
@@ -86,6 +87,9 @@ def main() -> None:
     except EXPECTED as error:
         raise SystemExit(_report(error)) from None
     except KeyboardInterrupt as stop:
+        # What was interrupted is not awaited any more: of coroutines and resources left behind, Python would warn after
+        # the one line that the user needs.
+        warnings.simplefilter("ignore")
         done = str(stop) or "no file is half-written"
         print(f"interrupted: {done}; run the same command again to go on", file=sys.stderr)
         raise SystemExit(INTERRUPTED) from None
