@@ -61,7 +61,26 @@ def rig():
 
 
 @pytest.fixture
-def command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., int]:
+def quick_reports(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Reports are made whole, but their pictures are empty files: drawing takes most of a small scan's time.
+
+    Tests marked ``drawn`` draw them, and figures in three dimensions from two sides.
+    """
+    from lsvision.report import embedding
+
+    def blank(figure: object, path: Path) -> embedding.Embedded:
+        for kind in ("png", "svg"):
+            path.with_name(f"{path.name}.{kind}").touch()
+        return embedding.Embedded(("data:image/png;base64,",), vector=False)
+
+    if request.node.get_closest_marker("drawn"):
+        monkeypatch.setattr(embedding, "_VIEWS", 2)
+    else:
+        monkeypatch.setattr("lsvision.report.pages.embed", blank)
+
+
+@pytest.fixture
+def command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, quick_reports: None) -> Callable[..., int]:
     """Run ``python -m lsvision.run`` in this process with overrides, in a folder of its own; returns the exit code."""
     from lsvision import run
 
