@@ -5,26 +5,25 @@ from collections.abc import Callable
 from pathlib import Path
 
 import hypothesis
-import jaxtyping
 import pytest
+import torch
+
+from tests.shapes import install_checks
 
 LIBRARY = Path(__file__).parents[1]
 # Not the options (config.py, study.points): the library itself reports a value of a wrong type there.
 STAGES = [
     path for path in (LIBRARY / "lsvision" / "stages").rglob("*.py") if path.name not in ("config.py", "__init__.py")
 ]
-jaxtyping.install_import_hook(
+install_checks(
     [
         "lsvision.geometry",
         "lsvision.estimation",
         "lsvision.image",
         *(f"lsvision.study.{name}" for name in ("map", "runs", "tables")),
         *(".".join(path.relative_to(LIBRARY).with_suffix("").parts) for path in STAGES),
-    ],
-    "beartype.beartype",
+    ]
 )
-
-import torch  # noqa: E402
 
 torch.set_num_threads(1)  # before the fixtures of wider scope; xdist's workers share the processor
 
