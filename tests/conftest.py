@@ -1,5 +1,6 @@
 """Shapes are checked while the tests run; every test starts from one seed and one thread."""
 
+import gc
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -35,6 +36,11 @@ hypothesis.settings.load_profile("seeded")
 ONE_THREAD = ("++threads=1",)
 
 SHARED_DATA = Path(__file__).parents[2] / "shared" / "data"
+
+
+def pytest_collection_finish() -> None:
+    """Libraries and tests stay: the garbage collector need not look through them again and again."""
+    gc.freeze()
 
 
 @pytest.fixture(autouse=True)

@@ -7,6 +7,7 @@ same shapes: checking every call would more than double the time of the tests.
 import functools
 import inspect
 from collections.abc import Callable
+from dataclasses import is_dataclass
 from typing import Any
 
 import jaxtyping
@@ -24,19 +25,21 @@ def install_checks(modules: list[str]) -> None:
 def _check_every_shape(*, typechecker: Callable) -> Callable:
     def decorate(plain: Any) -> Any:
         if not inspect.isclass(plain):
-            return _once_for_every_shape(plain, _check_every_call(plain, typechecker=typechecker))
-        if "__init__" in vars(plain):
-            own = plain.__init__
-            checked = _check_every_call(plain, typechecker=typechecker).__init__
-            plain.__init__ = _once_for_every_shape(own, checked)
+            return _once_for_every_shape(plain, typechecker)
+        if is_dataclass(plain) and "__init__" in vars(plain):
+            plain.__init__ = _once_for_every_shape(plain.__init__, typechecker)
         return plain
 
     return decorate
 
 
-def _once_for_every_shape(plain: Callable, checked: Callable) -> Callable:
+def _once_for_every_shape(plain: Callable, typechecker: Callable) -> Callable:
     """A function that is checked where its arguments have types and shapes that it was not called with before."""
     known = set()
+
+    @functools.cache
+    def checked() -> Callable:
+        return _check_every_call(plain, typechecker=typechecker)  # when it is called first: most never are
 
     @functools.wraps(plain)
     def call(*args: Any, **kwargs: Any) -> Any:
@@ -44,7 +47,7 @@ def _once_for_every_shape(plain: Callable, checked: Callable) -> Callable:
         shapes = (*map(_shape, args), *kwargs, *map(_shape, kwargs.values()))
         if shapes in known:
             return plain(*args, **kwargs)
-        result = checked(*args, **kwargs)
+        result = checked()(*args, **kwargs)
         known.add(shapes)
         return result
 
