@@ -7,7 +7,7 @@ import sys
 import threading
 import time
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
 from typing import TYPE_CHECKING, NoReturn
@@ -27,6 +27,10 @@ class _State:
     """What has arrived in this process; ``held`` counts the blocks that must not be interrupted."""
 
     def __init__(self) -> None:
+        self.forget()
+
+    def forget(self) -> None:
+        """Start afresh."""
         self.received: signal.Signals | None = None
         self.last = -_ONE_PRESS_SECONDS
         self.held = 0
@@ -46,19 +50,17 @@ def interruptible() -> Iterator[None]:
     """Turn a signal within the block into ``KeyboardInterrupt``, and that into one line and the shells' exit code.
 
     The line is the exception's text, or that no file is half-written. A signal that the parent has turned off (as
-    ``nohup`` and ``&`` do) stays so.
+    ``nohup`` and ``&`` do) stays so. After the block, which is all that the program does, signals are ignored: nothing
+    is left to be interrupted, and the interpreter would print a trace.
 
     Raises:
         SystemExit: 130 after Ctrl-C, 143 after SIGTERM.
     """
     hooks = sys.unraisablehook, threading.excepthook
-    handlers = {number: signal.getsignal(number) for number in _WORDS}
-    _state.__init__()  # type: ignore[misc]
+    _state.forget()
     try:
         sys.unraisablehook, threading.excepthook = _swallowed, _in_thread
-        for number, handler in handlers.items():
-            if handler is not signal.SIG_IGN and _in_main_thread():
-                signal.signal(number, _interrupt)
+        _handle(_interrupt)
         yield
     except BaseException as error:
         if not isinstance(error, KeyboardInterrupt) and not was_interrupted():
@@ -67,9 +69,7 @@ def interruptible() -> Iterator[None]:
     finally:
         if not was_interrupted():
             sys.unraisablehook, threading.excepthook = hooks
-            for number, handler in handlers.items():
-                if signal.getsignal(number) is not handler:
-                    signal.signal(number, handler)
+            _handle(signal.SIG_IGN)
 
 
 @contextmanager
@@ -106,6 +106,12 @@ def hidden_from_children() -> Iterator[None]:
 
 def _in_main_thread() -> bool:
     return threading.current_thread() is threading.main_thread()
+
+
+def _handle(handler: Callable[[int, FrameType | None], None] | signal.Handlers) -> None:
+    for number in _WORDS:
+        if signal.getsignal(number) is not signal.SIG_IGN and _in_main_thread():
+            signal.signal(number, handler)
 
 
 def _interrupt(number: int, _: FrameType | None) -> None:
@@ -153,8 +159,7 @@ def _in_thread(failed: threading.ExceptHookArgs) -> None:
 def _end(done: str) -> NoReturn:
     received = _state.received or signal.SIGINT
     code = 128 + received
-    for number in _WORDS:
-        signal.signal(number, lambda *_: os._exit(code))  # threads that the interpreter waits for may take long
+    _handle(lambda *_: os._exit(code))  # threads that the interpreter waits for may take long
     warnings.simplefilter("ignore")
     line = f"{_WORDS[received]}: {done or 'no file is half-written'}; run the same command again to go on"
     print(line, file=sys.stderr, flush=True)
