@@ -4,6 +4,8 @@ import json
 
 import pytest
 
+pytestmark = [pytest.mark.slow, pytest.mark.drawn]
+
 
 def _check(summary, *, sheet_px):
     paper, still, vibrating = summary["paper"], summary["still"], summary["vibrating"]
@@ -34,7 +36,6 @@ def _check(summary, *, sheet_px):
     assert products["sheet_rms_mm"]["after"] < 0.1 < 1.0 < products["sheet_rms_mm"]["before"]
 
 
-@pytest.mark.slow
 def test_the_paper_at_a_quarter_of_the_pixels(command, tmp_path):
     assert command("+experiment=paper") == 0
     _check(json.loads((tmp_path / "run" / "summary.json").read_text()), sheet_px=1.0)
@@ -42,7 +43,6 @@ def test_the_paper_at_a_quarter_of_the_pixels(command, tmp_path):
     assert not list(tmp_path.rglob("*.partial"))
 
 
-@pytest.mark.slow
 def test_the_paper_at_a_tenth_of_the_pixels(command, tmp_path):
     assert command("+experiment=paper", "scale=10", "vibrating.seed=100") == 0
     _check(json.loads((tmp_path / "run" / "summary.json").read_text()), sheet_px=1.0)
