@@ -1,6 +1,7 @@
 """Shapes are checked while the tests run; every test starts from one seed and one thread."""
 
 import gc
+import signal
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -97,6 +98,10 @@ def command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, quick_reports: None
             run.main()
         except SystemExit as stop:
             return int(stop.code or 0)
+        finally:  # a program ignores signals at its end; the tests go on
+            for number, handler in handlers.items():
+                signal.signal(number, handler)
         return 0
 
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
     return call

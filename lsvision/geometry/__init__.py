@@ -22,9 +22,10 @@ from lsvision.geometry.camera import (
     triangulation_jacobian,
     zero_disparity_mm,
 )
+from lsvision.geometry.line_motion import shaken, steadied, steadied_jacobian, uneven_travel, without_trend
 from lsvision.geometry.motion import displace, line_at, scan_position, travel_at, travel_sigma
-from lsvision.geometry.product import (
-    ProductFrame,
+from lsvision.geometry.product import ProductFrame
+from lsvision.geometry.product_axes import (
     aligned_rotation,
     from_product,
     motion_sigma,
@@ -69,8 +70,11 @@ __all__ = [
     "rotation_from_vector",
     "scaled_rig",
     "scan_position",
+    "shaken",
     "sharp_depth_mm",
     "slope_at",
+    "steadied",
+    "steadied_jacobian",
     "to_product",
     "transform",
     "travel_at",
@@ -78,6 +82,8 @@ __all__ = [
     "triangulate",
     "triangulate_general",
     "triangulation_jacobian",
+    "uneven_travel",
     "vector_from_rotation",
+    "without_trend",
     "zero_disparity_mm",
 ]

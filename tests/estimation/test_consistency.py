@@ -4,7 +4,7 @@ import pytest
 import torch
 from scipy.special import gammaincinv  # scipy.stats takes a second to import
 
-from lsvision.estimation import mean_chi_square_band, nees, nis
+from lsvision.estimation import chi_square_tail, mean_chi_square_band, nees, nis
 from tests.estimation.models import random, random_covariance
 
 
@@ -23,6 +23,13 @@ def test_cubature_points_lie_at_the_size_of_the_state():
 
 def test_nis_by_hand():
     assert nis(torch.tensor([3.0, 4.0]).double()).item() == 25.0
+
+
+def test_tail_is_scipys():
+    value = torch.tensor([[0.0], [3.0], [400.0]]).double()
+    expected = chi2.sf(value.numpy(), [1, 7])
+    torch.testing.assert_close(chi_square_tail(value, torch.tensor([1, 7])), torch.from_numpy(expected))
+    torch.testing.assert_close(chi_square_tail(value, 7.0)[:, 0], torch.from_numpy(expected[:, 1]))
 
 
 @pytest.mark.parametrize(("freedom", "runs", "probability"), [(9, 400, 0.95), (1, 1, 0.99), (3, 50, 0.9)])

@@ -21,6 +21,12 @@ def _check(summary, *, sheet_px):
     for method in ("joint", "two_step"):
         assert vibrating[method]["improvement"] >= paper["improvement"]
         assert vibrating[method]["rmse_after_mm"] == pytest.approx(paper["rmse_after_mm"], rel=0.2)
+    for scenario, bound in ((still, 0.06), (vibrating, paper["rmse_after_mm"])):
+        assert scenario["joint"]["held_out_rmse_mm"] < bound < 2.0 < scenario["held_out_rmse_before_mm"]
+    numbers = summary["paper_numbers"]
+    for key in ("rmse_before_mm", "rmse_after_mm", "stretch"):
+        assert numbers[key] == pytest.approx(paper[key], rel=0.003)
+    assert numbers["iterations"] == paper["iterations"]
     products = still["products"]
     for board in products["board_distance_rms_mm"].values():
         assert board["corners"] == 88

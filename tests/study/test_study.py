@@ -12,8 +12,8 @@ from hydra import compose, initialize_config_dir
 
 from lsvision.errors import ConfigError
 from lsvision.estimation import fisher_information, marginal_information
+from lsvision.experiments.command import config_folder
 from lsvision.geometry import displace, transform
-from lsvision.run import config_folder
 from lsvision.simulation import BoardPose
 from lsvision.stages.calibration.calibrate import calibrate_batch
 from lsvision.stages.calibration.config import CalibrationConfig

@@ -95,7 +95,7 @@ def _fit_together(windows: Windows, angles: Tensor, options: SaddleOptions) -> S
         position=parameters.position,
         covariance=inverse_normal[:, POSITION, POSITION] * variance[:, None, None],
         residuals=Residuals(fitted.residual, windows.weight, fitted.jacobian, inverse_normal, parameters.position),
-        blur_px=parameters.blur,
+        blur_px=(parameters.blur.square() + 1 / 12).sqrt(),
         contrast=parameters.contrast.abs(),
         residual=variance.sqrt(),
         valid=windows.complete & _is_corner(parameters, variance.sqrt(), windows, options),

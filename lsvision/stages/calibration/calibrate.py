@@ -126,7 +126,7 @@ class _Solution:
     noise_scale: Float[Tensor, "*batch"]
     scatter: Float[Tensor, "*batch"]
     along_scan: ErrorsAlongScan
-    prior_sigma: float
+    config: CalibrationConfig
 
     @property
     def weighed(self) -> BoardProblem:
@@ -144,7 +144,7 @@ class _Solution:
         motion_factor = torch.where(singular[..., None, None], torch.nan, posterior.factor[..., -3:, :])
         covariance = motion_factor @ motion_factor.mT
         if bool((self.scatter > 1).any()):
-            covariance = widened(covariance, self.scatter, self.prior_sigma)
+            covariance = widened(covariance, self.scatter, self.config.prior_sigma)
         return BatchCalibration(
             n=state[..., -3:],
             covariance=covariance,
@@ -163,9 +163,12 @@ class _Solution:
         )
 
     def _squared_residuals(self, path: Tensor) -> Tensor:
-        """Sums by iteration and board, mm²; errors along the scan are no fault of n, and poses take what they can."""
+        """Sums by iteration and board, mm²; errors along the scan are no fault of n, and poses take what they can.
+
+        The two-step scheme gives all corners one weight: its poses have taken it.
+        """
         squared, found = squared_residuals(self.problem, path), self.along_scan.found
-        if bool(found.any()):
+        if bool(found.any()) and self.config.method != "two_step":
             shaken = self.problem.at(found)
             squared[:, found] = squared_residuals(shaken, refitted(shaken, path[:, found]))
         return squared
@@ -190,7 +193,7 @@ def _solve(measured: BoardMeasurements, config: CalibrationConfig) -> _Solution:
         found.noise_scale,
         found.scatter,
         found.along_scan,
-        config.prior_sigma,
+        config,
     )
 
 

@@ -16,6 +16,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from lsvision.estimation import chi_square_tail
 from lsvision.estimation.gaussian_process import covariance_root
 from lsvision.stages.calibration.evidence import NormalEquations, Travel
 from lsvision.stages.calibration.kernels import AMPLITUDES, KNOTS, KernelFamily, kernel_family, wave_length
@@ -115,9 +116,8 @@ def suspicious(problem: BoardProblem, whitened: Float[Tensor, "*batch boards cor
         squares = (wave[..., None] * whitened).sum(-2).square()
         by_order.append((squares / wave.square().sum(-1).clamp(min=1.0)[..., None]).sum(-2))
     squares = torch.stack(by_order, dim=-1)
-    freedom = torch.tensor(problem.boards / 2, dtype=squares.dtype, device=squares.device)
-    single = torch.special.gammaincc(freedom.expand_as(squares), squares / 2)
-    together = torch.special.gammaincc((freedom * (_ORDERS + 1)).expand_as(squares[..., 0]), squares.sum(-1) / 2)
+    single = chi_square_tail(squares, float(problem.boards))
+    together = chi_square_tail(squares.sum(-1), float(problem.boards * (_ORDERS + 1)))
     tests = torch.cat([single.flatten(-2), together], dim=-1)
     return tests.amin(-1) * tests.shape[-1] < _SUSPICION
 

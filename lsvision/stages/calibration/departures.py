@@ -18,7 +18,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from lsvision.estimation import apply
+from lsvision.estimation import apply, chi_square_tail
 from lsvision.geometry import rotation_from_vector, scan_position
 from lsvision.stages.calibration.problem import BoardProblem, BoardState
 from lsvision.stages.calibration.reduction import feature_rows
@@ -106,7 +106,7 @@ class ReducedCorners:
     def noise_scale(self) -> Float[Tensor, "*batch boards"]:
         """Variance of the corners' own noise over the stated one; 1 where it is no larger, or not known."""
         per_freedom = self.noise_chi_square / self.noise_freedom.clamp(min=1)
-        unlikely = torch.special.gammaincc(self.noise_freedom.clamp(min=1) / 2, self.noise_chi_square / 2) < 1e-2
+        unlikely = chi_square_tail(self.noise_chi_square, self.noise_freedom.clamp(min=1)) < 1e-2
         return torch.where(unlikely & (self.noise_freedom > 0), per_freedom, 1.0)
 
     def scaled(self) -> "ReducedCorners":

@@ -7,6 +7,7 @@ from dataclasses import dataclass, fields
 import torch
 from torch import Tensor
 
+from lsvision.estimation import chi_square_tail
 from lsvision.stages.calibration.causes import NONE, Candidate, Wander, candidates, wanders
 from lsvision.stages.calibration.departure_fit import Beliefs, fit
 from lsvision.stages.calibration.departures import KINDS, ReducedCorners, placement
@@ -55,15 +56,14 @@ def contradictions_between(problem: BoardProblem, start: Tensor, scans: Sequence
     at = placement(problem, start).expanded((1,))
     plain = fit(reduced, at, assumed.hypothesis(at), Beliefs(assumed.motion_sigma))
     freedom = float(problem.boards * (reduced.smooth_freedom - 6) - 3)
-    if _probability(float(plain.chi_square), freedom) > _LOOKED_INTO:
+    if float(chi_square_tail(plain.chi_square, freedom)) > _LOOKED_INTO:
         return Findings()
     explanation = explain(reduced, at, assumed)
     words = _Words(scans, candidates(problem.boards, reduced.curved, at.n), explanation, _square_mm(problem))
     causes = words.causes()
-    left = float(explanation.chi_square)
     shake = words.wander(wanders(reduced.curved))
-    if not shake and _probability(left, freedom) < _CONTRADICTION:
-        causes = (*causes, _unexplained(left, freedom, bool(causes)))
+    if not shake and float(chi_square_tail(explanation.chi_square, freedom)) < _CONTRADICTION:
+        causes = (*causes, _unexplained(float(explanation.chi_square), freedom, bool(causes)))
     return Findings(causes, shake=shake)
 
 
@@ -191,11 +191,6 @@ def _unexplained(chi_square: float, freedom: float, partly: bool) -> str:
     return (
         f"{what} has a chi-square of {chi_square:.0f} where {freedom:.0f} is expected, and no single cause explains it"
     )
-
-
-def _probability(chi_square: float, freedom: float) -> float:
-    half = torch.tensor([freedom / 2, chi_square / 2], dtype=torch.float64)
-    return float(torch.special.gammaincc(half[0], half[1]))
 
 
 def _square_mm(problem: BoardProblem) -> float:

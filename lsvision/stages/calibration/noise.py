@@ -6,6 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from lsvision.estimation import chi_square_tail
 from lsvision.stages.calibration.config import CalibrationConfig
 from lsvision.stages.calibration.linearise import linearise, point_factor
 from lsvision.stages.calibration.problem import BoardProblem
@@ -51,7 +52,7 @@ def board_chi_square(problem: BoardProblem, state: Float[Tensor, "*batch state"]
 
 
 def _beyond_chance(squared: Tensor, freedom: Tensor) -> Tensor:
-    unlikely = torch.special.gammaincc(freedom / 2, squared / 2) < _NOISE_TEST_LEVEL
+    unlikely = chi_square_tail(squared, freedom) < _NOISE_TEST_LEVEL
     return torch.where(unlikely, squared / freedom, 1.0)
 
 
