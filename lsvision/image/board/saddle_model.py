@@ -117,11 +117,7 @@ class BlurredEdge:
         slope = (step[0] - step[1]) / width
         by_width = ((step[0] + step[1]) / 2 - value) / width - by_total * (width / (12 * total))
         return cls(
-            value,
-            slope,
-            by_total * (blur / total),
-            slope * along + by_width * width_by_angle,
-            torch.stack([cosine, sine]),
+            value, slope, by_total * (blur / total), slope * along + by_width * width_by_angle, torch.stack([cosine, sine])
         )
 
 
