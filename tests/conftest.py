@@ -40,8 +40,9 @@ SHARED_DATA = Path(__file__).parents[2] / "shared" / "data"
 
 
 def pytest_collection_finish() -> None:
-    """Libraries and tests stay: the garbage collector need not look through them again and again."""
+    """Libraries and tests stay: the garbage collector need not look through them again and again, nor so often."""
     gc.freeze()
+    gc.set_threshold(10_000, 20, 20)
 
 
 @pytest.fixture(autouse=True)
