@@ -9,7 +9,7 @@ import threading
 from collections import deque
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
-from multiprocessing import resource_tracker
+from multiprocessing import forkserver, resource_tracker
 from types import TracebackType
 from typing import Literal
 
@@ -49,9 +49,12 @@ class LocalEngine:
         self._busy: dict[Future, tuple[Task | None, ProcessPoolExecutor]] = {}
         self._failed_starts = 0
         resource_tracker.ensure_running()  # at its start it would make Ctrl-C visible again
-        with uninterrupted():
+        try:
             for _ in range(workers):
                 self._start_worker()
+        except BaseException:
+            self.__exit__(*sys.exc_info())
+            raise
 
     def __enter__(self) -> "LocalEngine":
         return self
@@ -137,12 +140,20 @@ class LocalEngine:
         while True:
             pool = ProcessPoolExecutor(1, mp_context=self._context, initializer=_enter_worker)
             try:
-                with uninterrupted(), hidden_from_children():
-                    self._busy[pool.submit(os.getpid)] = None, pool
+                self._busy[self._first_task(pool)] = None, pool
                 return
             except (OSError, EOFError, BrokenProcessPool):  # the server that workers are forked from was killed
                 pool.shutdown(wait=False)
                 self._count_failed_start()
+
+    def _first_task(self, pool: ProcessPoolExecutor) -> Future:
+        """Start a worker's process, which Ctrl-C does not reach."""
+        if self._context.get_start_method() == "forkserver":
+            with hidden_from_children():
+                forkserver.ensure_running()  # all that it forks inherit that; they wait for its imports, interruptibly
+            return pool.submit(os.getpid)
+        with hidden_from_children():
+            return pool.submit(os.getpid)
 
 
 def _forget_stdin() -> None:
