@@ -81,6 +81,8 @@ class SaddleModel:
 PLAIN = SaddleModel(((0, 0), (0, 1), (0, 2), (3, 0)))
 """``b + g·(u, v) + c E1 E2``: it has few minima."""
 FULL = SaddleModel(tuple(itertools.product(range(_LEVELS), range(_TERMS))))
+PIXEL_VARIANCE = 1 / 12
+"""Of a point within its pixel along any direction, px²."""
 
 
 @dataclass(frozen=True)
@@ -100,6 +102,8 @@ class BlurredEdge:
     by_angle: Float[Tensor, "corners pixels"]
     """Derivative by the angle of the normal, 1/rad."""
     normal: Float[Tensor, "2 corners 1"]
+    scaled: Float[Tensor, "corners pixels"]
+    """Distance from the edge over the blur of lens and pixel."""
 
     @classmethod
     def through_corner(cls, u: Tensor, v: Tensor, angle: Tensor, blur: Tensor) -> "BlurredEdge":
@@ -109,16 +113,25 @@ class BlurredEdge:
         upright = cosine.abs() >= sine.abs()
         width = torch.where(upright, cosine.abs(), sine.abs())
         width_by_angle = torch.where(upright, -cosine.sign() * sine, sine.sign() * cosine)
-        total = (blur.square() + (1 - width.square()) / 12).sqrt()
+        total = (blur.square() + (1 - width.square()) * PIXEL_VARIANCE).sqrt()
         ends = across + width / 2, across - width / 2
         step, bell = zip(*(_erf_and_bell(end, total) for end in ends), strict=True)
         by_total = (bell[0] - bell[1]) / width
         value = (ends[0] * step[0] - ends[1] * step[1]) / width + total * by_total
         slope = (step[0] - step[1]) / width
-        by_width = ((step[0] + step[1]) / 2 - value) / width - by_total * (width / (12 * total))
+        by_width = ((step[0] + step[1]) / 2 - value) / width - by_total * (PIXEL_VARIANCE * width / total)
         return cls(
-            value, slope, by_total * (blur / total), slope * along + by_width * width_by_angle, torch.stack([cosine, sine])
+            value=value,
+            slope=slope,
+            by_blur=by_total * (blur / total),
+            by_angle=slope * along + by_width * width_by_angle,
+            normal=torch.stack([cosine, sine]),
+            scaled=across / (blur.square() + PIXEL_VARIANCE).sqrt(),
         )
+
+    def by_kurtosis(self) -> Float[Tensor, "corners pixels"]:
+        """Change of the value where the blur has other tails than a bell: the next term of Edgeworth's series."""
+        return self.scaled * (self.scaled.square() - 3) * torch.exp(-self.scaled.square() / 2)
 
 
 def _erf_and_bell(distance: Tensor, blur: Tensor) -> tuple[Tensor, Tensor]:
@@ -170,3 +183,25 @@ class Saddle:
         ]
         by_levels = [self.shapes[:, level] * self.plane[term] for level, term in model.free_levels]
         return torch.stack([*by_shape, *by_levels], dim=1)
+
+    def other_shapes(self) -> Float[Tensor, "corners 5 pixels"]:
+        """Differences of real pictures from the model, which turn with the picture and so move no corner.
+
+        Brightness that is no linear function of the light (squares and cubes of the grey values), another blur across
+        one edge than across the other, and blurs that are no bell.
+        """
+        first, second = self.edges
+        _, a1, a2, a3 = self.levels.unbind(1)
+        weight_1, weight_2 = a1 + a3 * second.value, a2 + a3 * first.value
+        values = self.values()
+        centred = values - values.mean(-1, keepdim=True)
+        return torch.stack(
+            [
+                centred.square(),
+                centred.square() * centred,
+                weight_1 * first.by_blur,
+                weight_1 * first.by_kurtosis(),
+                weight_2 * second.by_kurtosis(),
+            ],
+            dim=1,
+        )
