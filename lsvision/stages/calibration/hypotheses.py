@@ -124,8 +124,8 @@ class _Search:
     def look_along_the_scans(self, plain: DepartureFit, here: DepartureFit) -> bool:
         """Whether errors along the scan were found, in problems whose residuals are correlated under their causes.
 
-        They are part of the corners' noise then, under which the causes have to be found again. Where they alone explain
-        as much as they do beside the causes, they are taken as they are alone.
+        They are part of the corners' noise then, under which the causes have to be found again. Where they alone
+        explain as much as they do beside the causes, they are taken as they are alone.
         """
         without, hypothesis, threshold = self.assumed.hypothesis(self.start), self.hypothesis(), math.log(_ACCEPTED)
         known, scale = Beforehand(0.0, _ACCEPTED), self.reduced.noise_scale.sqrt()

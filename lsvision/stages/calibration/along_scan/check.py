@@ -15,7 +15,7 @@ from lsvision.stages.calibration.along_scan.lines import COMPONENTS, Travel, dir
 from lsvision.stages.calibration.problem import BoardProblem
 
 # Residuals are called correlated where chance alone would correlate them as much with less than this probability.
-_SUSPICION = 0.005
+_SUSPICION = 0.002
 _ORDERS = 10  # of half-waves over the travel, that the residuals are tested for
 _IMPROBABLE = 1e-3  # probability of processes as large as those of a board, below which they are not what was modelled
 

@@ -69,16 +69,6 @@ class Conditional:
 
 
 @dataclass(frozen=True)
-class Weight:
-    """Log of the restricted likelihood of candidates, -inf where it cannot be computed, and the log of the volume that
-    is left to what the boards share: the root of the determinant of its covariance.
-    """
-
-    log_evidence: Float[Tensor, "*candidates"]
-    spread: Float[Tensor, "*candidates"]
-
-
-@dataclass(frozen=True)
 class NormalEquations:
     """Of one problem about a state: of the processes at the knots (``gram``), across (``cross``), of pose, n, residual.
 
@@ -128,7 +118,7 @@ class NormalEquations:
     ) -> Float[Tensor, ""]:
         """The log evidence, up to a constant, for processes of some components of given roots, and of no others."""
         rest = self._without(components, roots, self.state, self.cross[:, components])
-        return self.weigh(rest.matrix, rest.log_det).log_evidence
+        return self.of_states(rest.matrix, rest.log_det)
 
     def _without(self, others: Tensor, roots: Tensor, matrix: Tensor, across: Tensor) -> Conditional:
         """Normal equations freed from processes, to which they are coupled by ``across``."""
@@ -142,8 +132,10 @@ class NormalEquations:
         log_det = 2.0 * factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
         return Conditional(matrix - removed.mT @ removed, log_det)
 
-    def weigh(self, state: Float[Tensor, "*batch columns columns"], log_det: Float[Tensor, "*batch"]) -> "Weight":
-        """The log evidence, but for a constant, and the spread that is left to what the boards share.
+    def of_states(
+        self, state: Float[Tensor, "*batch columns columns"], log_det: Float[Tensor, "*batch"]
+    ) -> Float[Tensor, "*candidates"]:
+        """Log of the restricted likelihood, but for a constant; -inf where it cannot be computed.
 
         Noise that is larger than chance allows is scaled, as in ``noise.noise_scale``.
 
@@ -163,13 +155,12 @@ class NormalEquations:
         scale = torch.where(chi_square > limit, chi_square / freedom, 1.0)
         total = total - 2.0 * self.prior.diagonal().log().sum()
         log_evidence = -0.5 * (total + freedom * scale.log() + chi_square / scale)
-        spread = -pivots[..., :-1].log().sum(-1)
-        return Weight(log_evidence.nan_to_num(nan=-torch.inf, neginf=-torch.inf), spread.nan_to_num(nan=torch.inf))
+        return log_evidence.nan_to_num(nan=-torch.inf, neginf=-torch.inf)
 
-    def ratios(
+    def log_ratios(
         self, conditional: Conditional, family: KernelFamily, variances: Float[Tensor, " amplitudes"]
-    ) -> "Weight":
-        """Log likelihood ratios of a process of each kernel and variance, mm², to none, ``(kernels, amplitudes)``."""
+    ) -> Float[Tensor, "kernels amplitudes"]:
+        """Log likelihood ratios of a process of each kernel and variance, mm², to none."""
         process, cross = conditional.matrix[:, :KNOTS, :KNOTS], conditional.matrix[:, :KNOTS, KNOTS:]
         state, log_det = conditional.matrix[:, KNOTS:, KNOTS:], conditional.log_det
         parts = []
@@ -179,7 +170,5 @@ class NormalEquations:
             signal = variances[:, None] * values.clamp(min=0.0)[:, :, None]
             gain = variances[:, None] / (1.0 + signal)
             reduced = state[:, None, None] - (across * gain[..., None]).mT @ across
-            parts.append(self.weigh(reduced, log_det[:, None, None] + torch.log1p(signal).sum(-1)))
-        none = self.weigh(state, log_det)
-        log_evidence = torch.cat([part.log_evidence for part in parts]) - none.log_evidence
-        return Weight(log_evidence, torch.cat([part.spread for part in parts]) - none.spread)
+            parts.append(self.of_states(reduced, log_det[:, None, None] + torch.log1p(signal).sum(-1)))
+        return torch.cat(parts) - self.of_states(state, log_det)

@@ -17,9 +17,10 @@ from lsvision.estimation.gaussian_process import covariance_root, exponential, m
 KNOTS = 32
 INTERVALS = KNOTS - 3  # over the travel; interpolation takes one more knot at each end
 
-# Lengths of broad-band errors. Rough ones (exponential) that are shorter look like smooth ones (Matérn).
-_ROUGH_LENGTHS = (0.25, 0.5, 1.0)
-_SMOOTH_LENGTHS = (0.0625, 0.125, 0.25, 0.5, 1.0)
+# Lengths of broad-band errors. Rough ones (exponential) that are shorter look like smooth ones (Matérn). Longer ones
+# are drifts, which a few boards hardly tell from shorter ones, and of which the mean over kernels would consist.
+_ROUGH_LENGTHS = (0.25, 0.5)
+_SMOOTH_LENGTHS = (0.0625, 0.125, 0.25, 0.5)
 # Waves per unit. Those nearer to each other than a quarter look alike on one unit, but for the longest.
 _FREQUENCIES = (0.25, 0.35, 0.5, *(0.25 * k for k in range(3, 17)))
 _COHERENCE = 2.0  # of waves: how far one keeps its phase

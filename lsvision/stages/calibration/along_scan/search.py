@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from lsvision.estimation.gaussian_process import covariance_root
-from lsvision.stages.calibration.along_scan.evidence import Linearised, NormalEquations, Weight
+from lsvision.stages.calibration.along_scan.evidence import Linearised, NormalEquations
 from lsvision.stages.calibration.along_scan.kernels import AMPLITUDES, KNOTS, KernelFamily, kernel_family
 from lsvision.stages.calibration.along_scan.lines import COMPONENTS, Travel
 from lsvision.stages.calibration.problem import BoardProblem
@@ -27,9 +27,6 @@ _PROCESSES = 2  # of a component, that add up
 _PRESENT = (0.2, 0.1)  # prior probabilities of a component's first process, and of its second where the first is there
 _THERE = 0.5  # probability of a process from which a further one is looked for
 _FAINT = -12.0  # log weight, of the largest, below which a kernel is not tried again
-# Candidates that leave n least sure, of this probability together, have no part in the mean: a few of large amplitude
-# and length would make it theirs, and n far less sure than it mostly is.
-_TAIL = 0.1
 _SHARED = 0.5  # prior probability that all components err at the same wavelengths
 
 
@@ -105,7 +102,7 @@ class _Search:
 
     def found(self, log_odds: float) -> FoundErrors | None:
         """The errors that the corners show."""
-        alone = [self._ratios(component, 0, self.family).log_evidence for component in range(_COUNT)]
+        alone = [self._log_ratios(component, 0, self.family) for component in range(_COUNT)]
         by_component = torch.stack([torch.logsumexp((a + self.family.log_prior[:, None]).flatten(), 0) for a in alone])
         evidence = torch.logsumexp(by_component, 0) - math.log(_COUNT * len(AMPLITUDES))
         if not bool(evidence > log_odds):
@@ -134,25 +131,22 @@ class _Search:
     def _weigh(self, component: int, layer: int, family: KernelFamily, log_prior: Tensor) -> "_Weighed":
         """Set the covariance of one process to its mean over kernels and amplitudes."""
         present, absent = math.log(_PRESENT[layer]), math.log(1.0 - _PRESENT[layer])
-        found = self._ratios(component, layer, family)
-        ratios = found.log_evidence - math.log(len(AMPLITUDES))
+        ratios = self._log_ratios(component, layer, family) - math.log(len(AMPLITUDES))
         joint = ratios + log_prior[:, None] + present
         none = torch.logsumexp(log_prior, 0) + absent
         evidence = torch.logaddexp(torch.logsumexp(joint.flatten(), 0), none)
         weights = torch.exp(joint - evidence)
-        present_probability = float(weights.sum())
-        weights = _central(weights, found.spread)
         by_variance = (weights * self._variances(component)).sum(-1)
         self.covariances[component, layer] = torch.tensordot(by_variance, family.covariance, 1)
         by_kernel = torch.logsumexp(ratios, -1) + present
-        return _Weighed(torch.logaddexp(by_kernel, by_kernel.new_tensor(absent)), present_probability)
+        return _Weighed(torch.logaddexp(by_kernel, by_kernel.new_tensor(absent)), float(weights.sum()))
 
-    def _ratios(self, component: int, layer: int, family: KernelFamily) -> Weight:
+    def _log_ratios(self, component: int, layer: int, family: KernelFamily) -> Tensor:
         """Log likelihood ratios of a process of each kernel and amplitude to none, the others as they stand."""
         standing = self.covariances.clone()
         standing[component, layer] = 0.0
         given = self.equations.given(component, *self._present(standing.sum(1) + self.walk))
-        return self.equations.ratios(given, family, self._variances(component))
+        return self.equations.log_ratios(given, family, self._variances(component))
 
     def _present(self, covariance: Tensor) -> tuple[Tensor, Tensor]:
         """Which components err at all, and the roots of their covariances."""
@@ -170,16 +164,6 @@ class _Search:
         others = [self.by_kernel[other] for other in range(_COUNT) if other != component]
         ratio = sum((other - torch.logsumexp(other + prior, 0) for other in others), torch.zeros_like(prior))
         return prior + torch.logaddexp(ratio + math.log(_SHARED), prior.new_tensor(math.log(1.0 - _SHARED)))
-
-
-def _central(weights: Tensor, spread: Tensor) -> Tensor:
-    """Probabilities of candidates without the ``_TAIL`` of them that would leave n least sure, the rest scaled up."""
-    order = spread.flatten().argsort(descending=True)
-    sizes = weights.flatten()[order]
-    before = sizes.cumsum(0) - sizes
-    kept = (sizes - (_TAIL - before).clamp(min=0)).clamp(min=0)
-    central = torch.zeros_like(sizes).scatter(0, order, kept) / (1.0 - _TAIL)
-    return central.reshape(weights.shape)
 
 
 @dataclass(frozen=True)
