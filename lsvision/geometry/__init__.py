@@ -22,7 +22,15 @@ from lsvision.geometry.camera import (
     triangulation_jacobian,
     zero_disparity_mm,
 )
-from lsvision.geometry.line_motion import shaken, steadied, steadied_jacobian, uneven_travel, without_trend
+from lsvision.geometry.line_motion import (
+    LineAxes,
+    line_axes,
+    shaken,
+    steadied,
+    steadied_jacobian,
+    uneven_travel,
+    without_trend,
+)
 from lsvision.geometry.motion import displace, line_at, scan_position, travel_at, travel_sigma
 from lsvision.geometry.product import ProductFrame
 from lsvision.geometry.product_axes import (
@@ -46,6 +54,7 @@ __all__ = [
     "Camera",
     "CoplanarRig",
     "Intersection",
+    "LineAxes",
     "ProductFrame",
     "aligned_rotation",
     "camera_center_mm",
@@ -61,6 +70,7 @@ __all__ = [
     "from_product",
     "left_jacobian",
     "line_at",
+    "line_axes",
     "middle_point",
     "motion_sigma",
     "object_pitch_mm",

@@ -23,7 +23,8 @@ class LineFinding:
     ``state`` is ``corrected``; ``absent``, where nothing above the noise was there; or ``not observed``, where the
     object's shape does not show it. ``rms`` is that of the component, ``sigma`` the rms of its standard deviations over
     the lines, mm or rad; ``length_mm`` is the length along the travel over which it changes. ``evidence`` is how much
-    better the data fit with the component than without, in units of the logarithm of the likelihood.
+    better the data fit with the component than without, in units of the logarithm of the likelihood. ``reason`` says
+    why nothing was observed, where that is not the object's shape.
     """
 
     component: LineComponent
@@ -32,6 +33,7 @@ class LineFinding:
     sigma: NonNegative = 0.0
     length_mm: float | None = None
     evidence: float = 0.0
+    reason: str = "the object's shape does not show it"
 
     @property
     def in_words(self) -> str:
@@ -40,7 +42,7 @@ class LineFinding:
         if self.state == "absent":
             return f"{name}: no vibration above the noise"
         if self.state == "not observed":
-            return f"{name}: not observed, the object's shape does not show it"
+            return f"{name}: not observed, {self.reason}"
         length = "" if self.length_mm is None else f", over lengths of {self.length_mm:.2g} mm"
         return f"{name}: {self.rms * scale:.2g} {unit} rms, known to {self.sigma * scale:.2g} {unit}{length}"
 
