@@ -1,9 +1,8 @@
 """The one checker of options and of the entries of files.
 
-A frozen dataclass states on each field what the field may hold: type, range, default. A ``Checked`` dataclass is
-checked wherever it is made; ``build`` makes any dataclass from plain data, as YAML, JSON and the command line give it,
-and names the entry at fault. A number is finite unless its annotation says otherwise; true and "3" are no numbers, 3 is
-a number, 3.0 is no whole number. A list stands for a tuple, an unknown key is an error.
+A frozen dataclass states on each field what it may hold: type, range, default. A ``Checked`` dataclass is checked
+wherever it is made; ``build`` makes any dataclass from plain data and names the entry at fault. A number is finite
+unless its annotation says otherwise; true and "3" are no numbers, 3.0 is no whole number, a list stands for a tuple.
 """
 
 import difflib

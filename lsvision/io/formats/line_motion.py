@@ -42,7 +42,7 @@ _ROUNDING = 1e-6  # of correlations that were computed from covariances
 
 
 def write_line_motion(motion: LineMotion, path: Path | str) -> None:
-    """Write every component that was corrected or given, with its sigma and its correlations, and the findings."""
+    """Write all components, with the sigmas and correlations that are known, and the findings."""
     import polars  # takes a moment, which a scan without such a file need not wait for
 
     sigma = motion.sigma
@@ -52,17 +52,18 @@ def write_line_motion(motion: LineMotion, path: Path | str) -> None:
     for name, (i, j) in _PAIRS.items():
         scale = sigma[:, i] * sigma[:, j]
         columns[name] = torch.where(scale > 0, motion.covariance[:, i, j] / scale, 0.0).clamp(-1, 1)
-    kept = {name: values.numpy() for name, values in columns.items() if name == "line" or bool(values.any())}
+    always = ("line", *VALUE_COLUMNS)
+    kept = {name: values.numpy() for name, values in columns.items() if name in always or bool(values.any())}
     found = json.dumps([asdict(finding) for finding in motion.findings])
     with partial_file(path) as partial:
         polars.DataFrame(kept).write_parquet(partial, metadata={_FINDINGS: found} if motion.findings else None)
 
 
-def read_line_motion(path: Path | str, lines: int, travel: Travel) -> LineMotion:
+def read_line_motion(path: Path | str, lines: int, travel: Travel | None = None) -> LineMotion:
     """Read the motion of a scan.
 
     Args:
-        lines: of the scan. travel: of the scan, whose lines δy must leave in their order.
+        lines: of the scan. travel: of the scan, whose lines δy must leave in their order; None where that is known.
 
     Raises:
         FileFormatError: no such file, other columns, a line too many or too few, or a value that is not possible; names
@@ -79,10 +80,11 @@ def read_line_motion(path: Path | str, lines: int, travel: Travel) -> LineMotion
     sigma = torch.stack([columns.get(name, none) for name in SIGMA_COLUMNS], dim=1)
     covariance = sigma[:, :, None] * sigma[:, None, :] * _correlations(path, columns, lines)
     motion = LineMotion(values, covariance, _findings(path, found, columns))
-    try:
-        uneven_travel(travel, motion)
-    except ValueError:
-        raise FileFormatError(path, "the lines would not follow each other along the travel", "dy_mm") from None
+    if travel is not None:
+        try:
+            uneven_travel(travel, motion)
+        except ValueError:
+            raise FileFormatError(path, "the lines would not follow each other along the travel", "dy_mm") from None
     return motion
 
 

@@ -15,6 +15,7 @@ from torch import Tensor
 from lsvision.errors import FileFormatError
 from lsvision.io.images.chunk_size import check_chunks
 from lsvision.io.product.layout import FULL_LEVEL, PRODUCT_FORMAT, image_names
+from lsvision.io.product.line_motion import read_columns
 from lsvision.schema import shown
 from lsvision.types import ProductGrid, ProductStrip
 
@@ -48,6 +49,16 @@ class Product:
     def has_sigma(self) -> bool:
         """Whether the product holds the standard deviations of its positions."""
         return (self.path / "sigma").is_dir()
+
+    @property
+    def line_motion_source(self) -> str:
+        """Where the motion from line to line came from that was corrected; ``none`` where none was."""
+        entry = self.metadata.get("line_motion")
+        return str(entry.get("source", "none")) if isinstance(entry, Mapping) else "none"
+
+    def line_motion(self) -> dict[str, Float[Tensor, " lines"]]:
+        """Motion from line to line by name (``dx_mm``, ``dx_sigma_mm``, ..), of products that were corrected for it."""
+        return read_columns(zarr.open_group(self.path, mode="r"))
 
     def read(self, start: int, stop: int) -> ProductStrip:
         """Rows ``start..stop-1`` of every image."""

@@ -12,6 +12,7 @@ import yaml
 from lsvision.errors import FileFormatError
 from lsvision.io import read_line_motion, read_scan, scan_files, scan_sha256, write_line_motion
 from lsvision.types import LineFinding, LineMotion, Travel
+from tests.io.fuzz import fault_of
 
 LINES = 300  # of the fixture's scans
 TRAVEL = Travel(0.56)
@@ -31,8 +32,12 @@ def table(**columns: object) -> polars.DataFrame:
 
 
 def test_round_trip(tmp_path):
-    found = (LineFinding("dx", "corrected", 0.1, 0.01, 12.0, 30.0), LineFinding("dz", "corrected", 0.2),
-             LineFinding("roll", "corrected", 1e-3), LineFinding("dy", "not observed", reason="nobody looked"))  # fmt: skip
+    found = (
+        LineFinding("dx", "corrected", 0.1, 0.01, 12.0, 30.0),
+        LineFinding("dz", "corrected", 0.2),
+        LineFinding("roll", "corrected", 1e-3),
+        LineFinding("dy", "not observed", reason="nobody looked"),
+    )
     made = motion(findings=found)
     write_line_motion(made, tmp_path / "m.parquet")
     read = read_line_motion(tmp_path / "m.parquet", LINES, TRAVEL)
@@ -70,7 +75,7 @@ FAULTS = {
     "line break": ({"d\nx": [0.1] * LINES}, "unknown column"),
     "backwards": ({"dy_mm": [0.0, 1.0] * (LINES // 2)}, "dy_mm: the lines would not follow each other"),
     "correlations": (
-        {f"{pair}_correlation": [0.99 if pair != "dz_roll" else -0.99] * LINES for pair in ("dx_dz", "dx_roll", "dz_roll")},
+        {f"{pair}_correlation": [r] * LINES for pair, r in (("dx_dz", 0.99), ("dx_roll", 0.99), ("dz_roll", -0.99))},
         "line 0: no covariance has such correlations",
     ),
 }  # fmt: skip
@@ -133,10 +138,7 @@ def test_damage_is_one_line(tmp_path, capfd):
             at = chance.randrange(len(data)) if chance.random() < 0.5 else -chance.randrange(1, 1500)
             data[at] = chance.randrange(256)
         file.write_bytes(data[: chance.choice([len(data), len(data), chance.randrange(len(data))])])
-        try:
-            read_line_motion(file, LINES, TRAVEL)
-        except FileFormatError as error:
-            assert len(str(error).splitlines()) == 1
+        assert fault_of(lambda: read_line_motion(file, LINES, TRAVEL)) is None
 
 
 def test_a_scan_names_its_log(make_scan: Callable[..., Path]):
