@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 
@@ -86,10 +86,7 @@ class FoundLineMotion:
 
 @dataclass(frozen=True)
 class FindLineMotion:
-    """Finds the motion from line to line of a scan and stores it; ``depth_store`` is None for the scan's own depth.
-
-    It works on one thread, so that the bits are the same wherever it runs.
-    """
+    """Finds the motion from line to line of a scan and stores it; ``depth_store`` is None for the scan's own depth."""
 
     scan: ScanFiles
     depth_store: str | None
@@ -100,7 +97,7 @@ class FindLineMotion:
 
     def run(self) -> FoundLineMotion:
         """Measure or read, and write."""
-        with planned_files(self.scan), _one_thread():
+        with planned_files(self.scan):
             motion = self._find(open_scan(self.scan))
         with naming_full_disk(self.store):
             write_line_motion(motion, self.store)
@@ -113,10 +110,19 @@ class FindLineMotion:
             return scan.line_motion
         depth = open_depth_store(self.depth_store) if self.depth_store else open_depth(self.scan, self.disparity)
         n = torch.tensor(self.n, dtype=torch.float64)
+        return measured_line_motion(scan, depth, Motion(n, n.diag() * 0), self.choice.config)
+
+
+def measured_line_motion(scan: Scan, depth: DepthSource, motion: Motion, config: LineMotionConfig) -> LineMotion:
+    """Measure the motion of a scan on its profile, on one thread: the bits are the same wherever it runs.
+
+    What cannot be measured is no error: the findings say why.
+    """
+    with _one_thread():
         try:
-            return measure_line_motion(scan, DepthAlone(depth), Motion(n, n.diag() * 0), self.choice.config)
+            return measure_line_motion(scan, DepthAlone(depth), motion, config)
         except (IndexError, ValueError, torch.linalg.LinAlgError) as error:  # an object of next to no samples
-            log.warning("%s: no line motion can be measured: %s", self.scan.path, on_one_line(error))
+            log.warning("%s: no line motion can be measured: %s", scan.path, on_one_line(error))
             return not_measured(scan.lines, "the scan shows no profile that lines can be registered to")
 
 
@@ -156,19 +162,23 @@ class StoredLineMotion:
         return cls(motion, origin, hashlib.sha256(content).hexdigest())
 
     def metadata(self, travel: Travel) -> dict[str, object]:
-        """What a product says about it: plain data."""
-        lines = torch.arange(self.motion.lines, dtype=torch.float64)
-        pitch = float(travel_at(travel, lines).diff().abs().mean())
-        corrected = [finding.component for finding in self.motion.findings if finding.state == "corrected"]
-        band = band_of_power(self.motion.values, pitch) if self.origin == "measured" else None
-        return {
-            "source": self.origin,
-            "sha256": self.sha256,
-            "corrected": corrected,
-            "components": [{**asdict(finding), "in_words": finding.in_words} for finding in self.motion.findings],
-            "ambiguous_wavelengths_mm": list(band) if band else None,
-            "note": ambiguity_in_words(band) if band else "",
-        }
+        """What a product says about it."""
+        return {**line_motion_metadata(self.motion, self.origin, travel), "sha256": self.sha256}
+
+
+def line_motion_metadata(motion: LineMotion, origin: Origin, travel: Travel) -> dict[str, Any]:
+    """What is known about a motion, as plain data: its source, its components, and what may be shape instead."""
+    lines = torch.arange(motion.lines, dtype=torch.float64)
+    advance = float(travel_at(travel, lines).diff().abs().mean())
+    band = band_of_power(motion.values, advance) if origin == "measured" else None
+    return {
+        "source": origin,
+        "advance_mm": advance,
+        "corrected": [finding.component for finding in motion.findings if finding.state == "corrected"],
+        "components": [{**asdict(finding), "in_words": finding.in_words} for finding in motion.findings],
+        "ambiguous_wavelengths_mm": list(band) if band else None,
+        "note": ambiguity_in_words(band) if band else "",
+    }
 
 
 def ambiguity_in_words(band: tuple[float, float]) -> str:

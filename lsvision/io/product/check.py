@@ -51,7 +51,7 @@ def _check(product: Product) -> ProductCheck:
         levels = _check_metadata(product, name, root[name])
         for level in range(levels):
             _check_level(product, f"{name}/{level}", root[f"{name}/{level}"], level_shape(product.shape, level))
-    check_line_motion(product.path, root, product.line_motion_source != "none")
+    check_line_motion(product.path, root, product.has_line_motion)
     measured = _check_cells(product, chunk_rows=root["height/0"].chunks[0])
     rows, columns = product.shape
     share = measured.count / (rows * columns)

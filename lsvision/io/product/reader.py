@@ -4,7 +4,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -51,10 +51,15 @@ class Product:
         return (self.path / "sigma").is_dir()
 
     @property
-    def line_motion_source(self) -> str:
-        """Where the motion from line to line came from that was corrected; ``none`` where none was."""
+    def line_motion_metadata(self) -> Mapping[str, Any]:
+        """What the product says about the motion from line to line; empty where it says nothing."""
         entry = self.metadata.get("line_motion")
-        return str(entry.get("source", "none")) if isinstance(entry, Mapping) else "none"
+        return entry if isinstance(entry, Mapping) else {}
+
+    @property
+    def has_line_motion(self) -> bool:
+        """Whether the product says that a motion from line to line was looked for or given."""
+        return str(self.line_motion_metadata.get("source", "none")) != "none"
 
     def line_motion(self) -> dict[str, Float[Tensor, " lines"]]:
         """Motion from line to line by name (``dx_mm``, ``dx_sigma_mm``, ..), of products that were corrected for it."""
