@@ -53,8 +53,9 @@ def in_line_with_neighbours(
 ) -> Bool[Tensor, " corners"]:
     """Valid corners that lie where their neighbours on the board expect them.
 
-    Each is compared with the median of what pairs of neighbours say, on both of its sides or on one. What is too far
-    follows from the board itself: under vibration all corners are out of line.
+    Each is compared with the median of what pairs of neighbours say: those on both of its sides where it has such, as
+    at a corner of the board, or beside hidden ones, it can only be extrapolated. What is too far follows from how far
+    the same makes the board's other corners: under vibration or uneven travel all are out of line.
     """
     if int(valid.sum()) < _FEWEST_IN_LINE:
         return valid
@@ -62,16 +63,27 @@ def in_line_with_neighbours(
     node = torch.stack(torch.meshgrid(*(torch.arange(n).to(grid) for n in grid.shape[:2]), indexing="ij"), dim=-1)
     bent = grid - QuadraticMap.fitted(node[seen], grid[seen])(node)
     bent = torch.where(seen[..., None], bent, torch.nan)
-    apart = (bent - _expected(bent)).reshape(-1, 2).abs()
-    spread = _NORMAL * apart.nanmedian(0).values
-    limit = _OUT_OF_LINE_SPREADS * torch.where(torch.isfinite(spread), spread, torch.inf) + _OUT_OF_LINE_PX
-    return valid & ~(apart > limit).any(-1)
+    between, beyond = _said_by_neighbours(bent)
+    is_between = between.isfinite().any(0)
+    far = torch.where(
+        is_between,
+        _is_far(bent - torch.cat([between, beyond]).nanmedian(0).values, is_between),
+        _is_far(bent - beyond.nanmedian(0).values, seen[..., None]),
+    )
+    return valid & ~far.any(-1).flatten()
 
 
-def _expected(bent: Tensor) -> Tensor:
-    """Median of what the neighbours along both axes say of each place; NaN where it is between none of them.
+def _is_far(apart: Tensor, judged: Tensor) -> Tensor:
+    """Where differences (rows, columns, 2) are far above those of the places that are judged alike."""
+    size = torch.where(judged, apart.abs(), torch.nan)
+    spread = _NORMAL * size.reshape(-1, 2).nanmedian(0).values
+    return apart.abs() > _OUT_OF_LINE_SPREADS * torch.where(spread.isfinite(), spread, torch.inf) + _OUT_OF_LINE_PX
 
-    A corner of the board itself could only be extrapolated: uneven travel would look like an error.
+
+def _said_by_neighbours(bent: Tensor) -> tuple[Tensor, Tensor]:
+    """Where the neighbours along both axes put each place: means of two (2, rows, columns, 2), extrapolations (4, ..).
+
+    NaN where such neighbours are missing.
     """
     padded = F.pad(bent, (0, 0, 2, 2, 2, 2), value=torch.nan)
     rows, columns = bent.shape[:2]
@@ -79,16 +91,12 @@ def _expected(bent: Tensor) -> Tensor:
     def beside(down: int, right: int) -> Tensor:
         return padded[2 + down : 2 + down + rows, 2 + right : 2 + right + columns]
 
-    said = []
+    between, beyond = [], []
     for down, right in ((0, 1), (1, 0)):
         before, after = beside(-down, -right), beside(down, right)
-        said += [
-            (before + after) / 2,
-            2 * before - beside(-2 * down, -2 * right),
-            2 * after - beside(2 * down, 2 * right),
-        ]
-    between = said[0].isfinite() | said[3].isfinite()
-    return torch.where(between, torch.stack(said).nanmedian(0).values, torch.nan)
+        between.append((before + after) / 2)
+        beyond += [2 * before - beside(-2 * down, -2 * right), 2 * after - beside(2 * down, 2 * right)]
+    return torch.stack(between), torch.stack(beyond)
 
 
 def _median(values: Tensor, valid: Tensor) -> Tensor:

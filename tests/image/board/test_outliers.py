@@ -58,7 +58,7 @@ def curved_grid() -> Tensor:
 def test_a_corner_out_of_line_with_its_neighbours():
     grid = curved_grid()
     assert in_line_with_neighbours(grid, ALL).all()
-    for places in ([(3, 4)], [(0, 5)], [(4, 10), (7, 3)], [(2, 2), (2, 3)]):
+    for places in ([(3, 4)], [(0, 5)], [(4, 10), (7, 3)], [(2, 2), (2, 3)], [(0, 0)], [(7, 10)]):
         moved = grid.clone()
         for row, column in places:
             moved[row, column, 0] += 1.5
@@ -71,6 +71,15 @@ def test_under_vibration_all_corners_are_out_of_line_and_stay():
     line = torch.arange(8.0)[:, None] * 3.0 + torch.arange(11.0) * 0.4
     grid[..., 0] += 2.0 * torch.sin(line.double())
     assert in_line_with_neighbours(grid, ALL).all()
+
+
+def test_a_wrong_corner_beside_a_hidden_one_at_the_rim():
+    grid, valid = curved_grid(), ALL.clone()
+    valid[5] = False
+    grid[0, 6] += 3.0
+    kept = in_line_with_neighbours(grid, valid)
+    assert not kept[6]
+    assert int(kept.sum()) == 86
 
 
 def test_missing_neighbours_cost_no_corner():
