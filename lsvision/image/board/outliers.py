@@ -34,17 +34,20 @@ def like_the_board(fit: SaddleFit, valid: Bool[Tensor, " corners"]) -> Bool[Tens
 
 
 def evenly_clipped(
-    windows: Float[Tensor, "corners size size"],
+    brightest: Float[Tensor, "corners size size"],
     mask: Bool[Tensor, "corners size size"],
     valid: Bool[Tensor, " corners"],
 ) -> Bool[Tensor, " corners"]:
     """Valid corners whose windows have no more pixels at the end of the sensor's range than the board's median.
 
     Where white squares are clipped evenly the corners stay where they are; at the rim of glare they move.
+
+    Args:
+        brightest: the largest of each pixel's colours, of which any may be clipped alone.
     """
-    brightest = float(windows[valid].max()) if bool(valid.any()) else 0.0
-    end = 2 ** max(8, int(brightest).bit_length()) - 1
-    share = (mask & (windows >= _CLIPPED_LEVEL * end)).sum((1, 2)) / mask.sum((1, 2))
+    most = float(brightest[valid].max()) if bool(valid.any()) else 0.0
+    end = 2 ** max(8, int(most).bit_length()) - 1
+    share = (mask & (brightest >= _CLIPPED_LEVEL * end)).sum((1, 2)) / mask.sum((1, 2))
     return valid & ((share <= _CLIPPED_APART) | ((share - _median(share, valid)).abs() <= _CLIPPED_APART))
 
 
