@@ -13,7 +13,7 @@ from lsvision.image.brightness import gray
 from lsvision.types import LineImage
 
 _READ_LINES = 512
-_MODEL_PX = 0.001  # a pixel's box is no Gaussian: the error that a sharp image without noise or texture leaves
+_MODEL_PX = 0.001  # the error that a sharp image without noise or texture leaves: a turned pixel is no box
 _INTO_SQUARES = 0.4  # share of a square that a window takes in: blur and shift stay clear of the next edges
 _FEWEST_PIXELS = 49  # of the squares in a window
 
