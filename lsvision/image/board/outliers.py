@@ -56,9 +56,9 @@ def in_line_with_neighbours(
 ) -> Bool[Tensor, " corners"]:
     """Valid corners that lie where their neighbours on the board expect them.
 
-    Each is compared with the median of what pairs of neighbours say: those on both of its sides where it has such, as
-    at a corner of the board, or beside hidden ones, it can only be extrapolated. What is too far follows from how far
-    the same makes the board's other corners: under vibration or uneven travel all are out of line.
+    Each is compared with the median of what pairs of neighbours say. At a corner of the board, or beside hidden ones,
+    it can only be extrapolated; then all that is said must be far off. What is too far follows from how far the same makes
+    the board's other corners: under vibration or uneven travel all are out of line.
     """
     if int(valid.sum()) < _FEWEST_IN_LINE:
         return valid
@@ -68,18 +68,16 @@ def in_line_with_neighbours(
     bent = torch.where(seen[..., None], bent, torch.nan)
     between, beyond = _said_by_neighbours(bent)
     is_between = between.isfinite().any(0)
-    far = torch.where(
-        is_between,
-        _is_far(bent - torch.cat([between, beyond]).nanmedian(0).values, is_between),
-        _is_far(bent - beyond.nanmedian(0).values, seen[..., None]),
-    )
-    return valid & ~far.any(-1).flatten()
+    apart = torch.where(is_between, bent - torch.cat([between, beyond]).nanmedian(0).values, torch.nan)
+    far = _is_far(apart[None])[0]
+    extrapolated = bent - beyond
+    all_far = (_is_far(extrapolated) | extrapolated.isnan()).all(0) & extrapolated.isfinite().any(0)
+    return valid & ~torch.where(is_between, far, all_far).any(-1).flatten()
 
 
-def _is_far(apart: Tensor, judged: Tensor) -> Tensor:
-    """Where differences (rows, columns, 2) are far above those of the places that are judged alike."""
-    size = torch.where(judged, apart.abs(), torch.nan)
-    spread = _NORMAL * size.reshape(-1, 2).nanmedian(0).values
+def _is_far(apart: Float[Tensor, "ways rows columns 2"]) -> Bool[Tensor, "ways rows columns 2"]:
+    """Differences that are far above those of the board, for each way of looking at it."""
+    spread = _NORMAL * apart.abs().flatten(1, 2).nanmedian(1).values[:, None, None]
     return apart.abs() > _OUT_OF_LINE_SPREADS * torch.where(spread.isfinite(), spread, torch.inf) + _OUT_OF_LINE_PX
 
 
