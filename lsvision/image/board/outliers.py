@@ -57,8 +57,8 @@ def in_line_with_neighbours(
     """Valid corners that lie where their neighbours on the board expect them.
 
     Each is compared with the median of what pairs of neighbours say. At a corner of the board, or beside hidden ones,
-    it can only be extrapolated; then all that is said must be far off. What is too far follows from how far the same makes
-    the board's other corners: under vibration or uneven travel all are out of line.
+    it can only be extrapolated, the way that works best on this board. What is too far follows from how far the same
+    makes the board's other corners: under vibration or uneven travel all are out of line.
     """
     if int(valid.sum()) < _FEWEST_IN_LINE:
         return valid
@@ -69,16 +69,17 @@ def in_line_with_neighbours(
     between, beyond = _said_by_neighbours(bent)
     is_between = between.isfinite().any(0)
     apart = torch.where(is_between, bent - torch.cat([between, beyond]).nanmedian(0).values, torch.nan)
-    far = _is_far(apart[None])[0]
-    extrapolated = bent - beyond
-    all_far = (_is_far(extrapolated) | extrapolated.isnan()).all(0) & extrapolated.isfinite().any(0)
-    return valid & ~torch.where(is_between, far, all_far).any(-1).flatten()
+    over = torch.where(is_between, _over_limit(apart[None]), _over_limit(bent - beyond))
+    return valid & ~(over > 0).any(-1).flatten()
 
 
-def _is_far(apart: Float[Tensor, "ways rows columns 2"]) -> Bool[Tensor, "ways rows columns 2"]:
-    """Differences that are far above those of the board, for each way of looking at it."""
-    spread = _NORMAL * apart.abs().flatten(1, 2).nanmedian(1).values[:, None, None]
-    return apart.abs() > _OUT_OF_LINE_SPREADS * torch.where(spread.isfinite(), spread, torch.inf) + _OUT_OF_LINE_PX
+def _over_limit(apart: Float[Tensor, "ways rows columns 2"]) -> Float[Tensor, "rows columns 2"]:
+    """By how much differences exceed what is usual on the board, the way that says most; NaN where none is known."""
+    size = apart.abs()
+    spread = _NORMAL * size.flatten(1, 2).nanmedian(1).values[:, None, None]
+    limit = _OUT_OF_LINE_SPREADS * torch.where(spread.isfinite(), spread, torch.inf) + _OUT_OF_LINE_PX
+    best = torch.where(size.isfinite(), limit, torch.inf).argmin(0, keepdim=True)
+    return (size - limit).gather(0, best)[0]
 
 
 def _said_by_neighbours(bent: Tensor) -> tuple[Tensor, Tensor]:
