@@ -1,6 +1,7 @@
 """What a person types wrongly, or in another language: one line, and an exit code that says which."""
 
 import io
+import logging
 import os
 import signal
 import subprocess
@@ -29,6 +30,11 @@ REPROCESS = ("+experiment=reprocess", "calibration=c.json")
         (["+experiment=calibrate", "scans=[5]"], "scans[0]: expected text, got 5"),
         (["+experiment=calibrate", "scans=5"], "scans: expected a list, got 5"),
         (["+experiment=correct", "scan=a", "calibration=c.json", "export=[obj]"], "export[0]: expected 'tiff', 'ply'"),
+        ([*REPROCESS, "archive='reference://'", "output=o"], "archive: reference:// cannot be read: "),
+        (
+            [*REPROCESS, "archive=.", "output=o", "engine=dask", "engine.scheduler=garbage"],
+            "engine.scheduler: expected an address as tcp://host:8786, got 'garbage'",
+        ),
         ([*REPROCESS, "archive=.", "output=o", "engine.workers=-1"], "engine.workers: expected a whole number >= 1"),
         (["+experiment=calibrate", "scans=[a"], "scans=[a: cannot be understood; put quotes"),
         (["+experiment=correct", "scan=a(b", "calibration=c.json"], "scan=a(b: cannot be understood"),
@@ -78,6 +84,15 @@ def test_a_folder_that_cannot_be_made_for_the_run(tmp_path, monkeypatch, capsys)
     assert stop.value.code == 1
     assert capsys.readouterr().err == f"error: {tmp_path}/afile/x: Not a directory\n"
     assert "HYDRA_FULL_ERROR" not in os.environ
+
+
+def test_a_log_that_cannot_be_written_does_not_bury_the_error(command, monkeypatch, capsys):
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(logging.Handler, "format", full)
+    assert command("+experiment=status", "output=nowhere") == 1
+    assert capsys.readouterr().err == "error: output: no ledger in nowhere\n"
 
 
 def test_letters_beyond_ascii_are_quoted():
