@@ -32,6 +32,7 @@ def toy(monkeypatch):
     monkeypatch.setattr("lsvision.experiments.study.run_study", experiment)
 
 
+@pytest.mark.drawn
 def test_twelve_jobs_of_which_two_fail(toy, command, tmp_path, capsys):
     folder = tmp_path / "sweep"
     assert command(*SWEEP, f"hydra.sweep.dir={folder}") == 1

@@ -1,5 +1,6 @@
 """Certificates for a Dask cluster: encrypted, and closed to whoever has none."""
 
+import importlib.util
 import shutil
 import subprocess
 from pathlib import Path
@@ -12,7 +13,7 @@ from lsvision.errors import ConfigError
 from lsvision.schema import build, option_fault
 from tests.archive.engines.test_engine import Number, collected
 
-pytest.importorskip("distributed")
+pytestmark = pytest.mark.skipif(importlib.util.find_spec("distributed") is None, reason="distributed is not here")
 
 
 @pytest.fixture

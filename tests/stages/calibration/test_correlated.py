@@ -8,18 +8,19 @@ import torch
 
 from lsvision.estimation import mean_chi_square_band, nees, upper_root
 from lsvision.estimation.gaussian_process import covariance_root
+from lsvision.stages.calibration.along_scan import Linearised, suspicious, with_processes
+from lsvision.stages.calibration.along_scan.evidence import NormalEquations
+from lsvision.stages.calibration.along_scan.kernels import INTERVALS, KNOTS, kernel_family, wave_length
+from lsvision.stages.calibration.along_scan.lines import Travel, directions
 from lsvision.stages.calibration.calibrate import calibrate, calibrate_batch
 from lsvision.stages.calibration.config import CalibrationConfig
-from lsvision.stages.calibration.correlated import suspicious, with_processes
-from lsvision.stages.calibration.evidence import NormalEquations, Travel
-from lsvision.stages.calibration.kernels import INTERVALS, KNOTS, kernel_family, wave_length
 from lsvision.stages.calibration.linearise import linearise, point_factor
 from lsvision.stages.calibration.methods import joint
 from lsvision.stages.calibration.model import residuals_in_sigmas, whitened_residuals
 from tests.stages.calibration.boards import RIG, Corners, simulate
 
-ROUGH, SMOOTH, WAVE = 3, 7, 30  # of the kernel family
-SIDEWAYS, TRAVEL, DEPTH = range(3)
+ROUGH, SMOOTH, WAVE = 1, 4, 13  # of the kernel family
+SIDEWAYS, TRAVEL, DEPTH, ROLL = range(4)
 
 
 def shaken(corners: Corners, rms_mm: float, wavelength_mm: float, components=(SIDEWAYS, DEPTH)) -> Corners:
@@ -44,16 +45,16 @@ def errors(corners: Corners, found) -> torch.Tensor:
 
 def dense_covariance(problem, roots: torch.Tensor) -> torch.Tensor:
     """Covariance of all points of each board, its white noise and the processes together."""
-    weights = Travel.of(problem).weights(problem)
+    weights, moved = Travel.of(problem).weights(problem), directions(problem)
     boards, corners = problem.valid.shape
     whole = torch.zeros(boards, corners, 3, corners, 3, dtype=torch.float64)
     for board in range(boards):
         for corner in range(corners):
             chol = problem.noise_chol[board, corner]
             whole[board, corner, :, corner, :] += chol @ chol.mT
-        for component in range(3):
-            part = weights[board] @ roots[component]
-            whole[board, :, component, :, component] += part @ part.mT
+        for component in range(4):
+            part = (moved[board, :, component, :, None] * (weights[board] @ roots[component])[:, None]).flatten(0, 1)
+            whole[board] += (part @ part.mT).reshape(corners, 3, corners, 3)
     return whole.reshape(boards, 3 * corners, 3 * corners)
 
 
@@ -77,8 +78,8 @@ def small_problem():
 
 def some_roots() -> torch.Tensor:
     family = kernel_family()
-    kernels = torch.stack([family.covariance[k] for k in (ROUGH, SMOOTH, WAVE)])
-    return covariance_root(kernels * torch.tensor([0.05, 0.1, 0.03]).double().square()[:, None, None])
+    kernels = torch.stack([family.covariance[k] for k in (ROUGH, SMOOTH, WAVE, SMOOTH)])
+    return covariance_root(kernels * torch.tensor([0.05, 0.1, 0.03, 0.04]).double().square()[:, None, None])
 
 
 def test_reduced_rows_are_those_of_the_dense_covariance():
@@ -109,16 +110,17 @@ def test_reduced_rows_are_those_of_the_dense_covariance():
 def test_evidence_is_the_restricted_likelihood_of_dense_covariances():
     problem, start = small_problem()
     posterior = joint(problem, start, CalibrationConfig())
-    equations = NormalEquations.of(problem, posterior.mean, prior_sigma=0.05)
+    equations = NormalEquations.of(problem, Linearised.of(problem, posterior.mean, prior_sigma=0.05))
     standing = some_roots()
     family = kernel_family()
     variance = torch.tensor([1e-4, 2e-3], dtype=torch.float64)
-    given = equations.given(TRAVEL, torch.tensor([SIDEWAYS, DEPTH]), standing[[SIDEWAYS, DEPTH]][None])
+    others = [SIDEWAYS, DEPTH, ROLL]
+    given = equations.given(TRAVEL, torch.tensor(others), standing[others][None])
     ratios = equations.log_ratios(given, family, variance)
 
     def naive(root: torch.Tensor) -> torch.Tensor:
         """-2 log likelihood, the poses and n marginalised, by the whitened rows of the whole state."""
-        roots = torch.stack([standing[SIDEWAYS], root, standing[DEPTH]])
+        roots = torch.stack([standing[SIDEWAYS], root, *standing[[DEPTH, ROLL]]])
         noise = with_processes(problem, roots[None])
         correlated = dataclasses.replace(problem, correlated=noise)
         rows = linearise(correlated, posterior.mean, point_factor(posterior.mean)).matrix

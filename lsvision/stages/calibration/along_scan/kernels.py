@@ -17,9 +17,13 @@ from lsvision.estimation.gaussian_process import covariance_root, exponential, m
 KNOTS = 32
 INTERVALS = KNOTS - 3  # over the travel; interpolation takes one more knot at each end
 
-_LENGTHS = tuple(2.0**k for k in range(-4, 1))  # of broad-band errors: rough (exponential) and smooth (Matérn)
-_WAVELENGTHS = tuple(4.0 * 2.0 ** (-k / 8.5) for k in range(35))  # 4 .. 1/4
-_COHERENCE = (1.5, 8.0)  # of waves: how far one keeps its phase
+# Lengths of broad-band errors. Rough ones (exponential) that are shorter look like smooth ones (Matérn). Longer ones
+# are drifts, which a few boards hardly tell from shorter ones, and of which the mean over kernels would consist.
+_ROUGH_LENGTHS = (0.25, 0.5)
+_SMOOTH_LENGTHS = (0.0625, 0.125, 0.25, 0.5)
+# Waves per unit. Those nearer to each other than a quarter look alike on one unit, but for the longest.
+_FREQUENCIES = (0.25, 0.35, 0.5, *(0.25 * k for k in range(3, 17)))
+_COHERENCE = 2.0  # of waves: how far one keeps its phase
 _WAVE_RANK = 16  # of a wave's covariance, the rest of which is rounding
 # Amplitudes, in units of the residuals' rms: prior log-uniform between them.
 AMPLITUDES = tuple(2.0**k for k in range(-5, 5))
@@ -54,8 +58,9 @@ def kernel_family() -> KernelFamily:
     """All kernels; broad-band errors and waves are as probable, and so are all of each."""
     place = torch.arange(KNOTS, dtype=torch.float64) / INTERVALS
     distance = place[:, None] - place
-    broad = [kernel(distance / length) for kernel in (exponential, matern32) for length in _LENGTHS]
-    waves = [narrow_band(distance, wavelength, coherence) for wavelength in _WAVELENGTHS for coherence in _COHERENCE]
+    broad = [exponential(distance / length) for length in _ROUGH_LENGTHS]
+    broad += [matern32(distance / length) for length in _SMOOTH_LENGTHS]
+    waves = [narrow_band(distance, 1.0 / frequency, _COHERENCE) for frequency in _FREQUENCIES]
     covariance = torch.stack(broad + waves)
     share = [0.5 / len(broad)] * len(broad) + [0.5 / len(waves)] * len(waves)
     roots = covariance_root(covariance)

@@ -1,0 +1,104 @@
+"""Samples of lines in the product frame, and the object's reference profile that they are compared with."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from lsvision.geometry import ProductFrame, depth_sigma, slope_at, zero_disparity_mm
+from lsvision.stages.line_motion.config import LineMotionConfig
+from lsvision.types import Depth
+
+_DISPARITY_SIGMA_PX = 0.09  # of a depth that comes without its own; the noise's true scale is estimated
+_SLOPE_REACH_MM = 0.4  # to either side of a place, over which the slope of a profile is taken
+
+
+@dataclass(frozen=True)
+class LineSamples:
+    """What some lines measured on some columns, float64: depth z and its standard deviation, mm, NaN where nothing.
+
+    ``slope`` is that of the columns' rays.
+    """
+
+    z: Float[Tensor, "lines columns"]
+    sigma: Float[Tensor, "lines columns"]
+    slope: Float[Tensor, " columns"]
+    columns: Int[Tensor, " columns"]
+
+    @classmethod
+    def of(cls, depth: Depth, frame: ProductFrame, config: LineMotionConfig) -> "LineSamples":
+        """All columns of some lines."""
+        z0, (low, high) = zero_disparity_mm(frame.rig), config.height_range_mm
+        z = depth.z.double()
+        z = z.masked_fill(~((z >= z0 - high) & (z <= z0 - low)), torch.nan)
+        given = depth.sigma
+        sigma = depth_sigma(frame.rig, z, _DISPARITY_SIGMA_PX) if given is None else given.double()
+        columns = torch.arange(z.shape[1])
+        return cls(z, sigma, slope_at(frame.rig, columns.double()), columns)
+
+    def on(self, columns: slice) -> "LineSamples":
+        """Those of some columns."""
+        return LineSamples(self.z[:, columns], self.sigma[:, columns], self.slope[columns], self.columns[columns])
+
+
+@dataclass(frozen=True)
+class Reference:
+    """Height of the object by place across the motion: node i lies at ``origin_mm + i step_mm``; NaN beside it."""
+
+    origin_mm: float
+    step_mm: float
+    height: Float[Tensor, " nodes"]
+    slope: Float[Tensor, " nodes"]
+
+    def at(self, q_x: Float[Tensor, "*batch"]) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch"]]:
+        """Height and its slope at places, linear between nodes; NaN beyond the object."""
+        place = (q_x - self.origin_mm) / self.step_mm
+        base = place.nan_to_num().floor().clamp(0, len(self.height) - 2).long()
+        part = place - base
+        part = part.masked_fill((part < 0) | (part > 1), torch.nan)
+        height, slope = (torch.lerp(values[base], values[base + 1], part) for values in (self.height, self.slope))
+        return height, slope
+
+
+def reference_profile(
+    q_x: Float[Tensor, "lines columns"], height: Float[Tensor, "lines columns"], step_mm: float, depth_mm: float
+) -> Reference | None:
+    """Median height by place of aligned lines, down to ``depth_mm`` under the highest; None where nothing was measured.
+
+    A place counts that half of the lines show.
+    """
+    measured = height.isfinite()
+    if not bool(measured.any()):
+        return None
+    origin = float(q_x[measured].min())
+    nodes = int((float(q_x[measured].max()) - origin) / step_mm) + 2
+    node = ((q_x[measured] - origin) / step_mm).round().long()
+    median, count = _median_by_node(node, height[measured], nodes)
+    common = median.masked_fill(count < len(q_x) / 2, torch.nan)
+    if not bool(common.isfinite().any()):
+        return None
+    crown = float(common.nan_to_num(-torch.inf).max())
+    profile = common.masked_fill(~(common >= crown - depth_mm), torch.nan)
+    reach = max(1, round(_SLOPE_REACH_MM / step_mm))
+    slope = torch.full_like(profile, torch.nan)
+    slope[reach:-reach] = (profile[2 * reach :] - profile[: -2 * reach]) / (2 * reach * step_mm)
+    return Reference(origin, step_mm, profile, slope)
+
+
+def columns_of(reference: Reference, q_x: Float[Tensor, "lines columns"], most: int) -> slice:
+    """At most so many columns, evenly spaced, that show the object on some of the lines with samples at ``q_x``."""
+    there = reference.slope.isfinite().nonzero()[[0, -1], 0]
+    low, high = (reference.origin_mm + reference.step_mm * there.double()).tolist()
+    shown = ((q_x > low) & (q_x < high)).any(0).nonzero()[:, 0]
+    first, end = int(shown[0]), int(shown[-1]) + 1
+    return slice(first, end, -(-(end - first) // most))
+
+
+def _median_by_node(node: Tensor, values: Tensor, nodes: int) -> tuple[Tensor, Tensor]:
+    """Median of the values of every node, and their number."""
+    order = values.argsort()
+    order = order[node[order].argsort(stable=True)]
+    count = torch.bincount(node, minlength=nodes)
+    middle = count.cumsum(0) - count + count // 2
+    return values[order][middle.clamp(max=len(values) - 1)], count
