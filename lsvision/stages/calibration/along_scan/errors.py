@@ -15,9 +15,8 @@ from lsvision.stages.calibration.along_scan.search import Beforehand, search
 from lsvision.stages.calibration.problem import BoardProblem
 from lsvision.stages.calibration.reduction import CorrelatedNoise, affine_features, rows_with_latents
 
-_BEYOND_DOUBT = (
-    1e-4  # probability of residuals below which they are no noise, though no errors along the scan are found
-)
+# Probability of residuals below which they are no noise, though no errors along the scan were found.
+_BEYOND_DOUBT = 1e-4
 
 
 @dataclass(frozen=True)
@@ -69,7 +68,8 @@ def errors_along_scan(
         linearised = Linearised.of(one, state[place], prior_sigma)
         errors = search(one, linearised, known)
         if errors is None:
-            found[place], unlike[place] = False, probability[place] < _BEYOND_DOUBT
+            found[place] = False
+            unlike[place] = (probability[place] < _BEYOND_DOUBT) & (known.process_sigma == 0)
             continue
         rms[place] = errors.rms_mm
         length[place] = wave_length(errors.covariance) * Travel.of(one).extent_mm
