@@ -290,7 +290,7 @@ def test_errors_that_no_component_describes_are_a_contradiction():
 @pytest.mark.slow
 def test_errors_that_are_modelled_are_rarely_said_to_be_unlike_any():
     torch.manual_seed(12)
-    sets = simulate(batch=(50,))
+    sets = simulate(batch=(20,))
     for corners in (shaken(sets, 0.03, 150.0), rough(sets, 0.05, 60.0)):
         assert solved(corners).along_scan_unlike.sum() <= 1
     assert solved(turned_about_the_view(sets, 3e-4, 150.0)).along_scan_unlike.double().mean() > 0.9
