@@ -59,7 +59,7 @@ def curved_grid() -> Tensor:
 def test_a_corner_out_of_line_with_its_neighbours():
     grid = curved_grid()
     assert in_line_with_neighbours(grid, ALL).all()
-    for places in ([(3, 4)], [(0, 5)], [(4, 10), (7, 3)], [(2, 2), (2, 3)]):
+    for places in ([(3, 4)], [(0, 5)], [(4, 10), (7, 3)], [(2, 2), (2, 3)], [(0, 0)], [(7, 10)]):
         moved = grid.clone()
         for row, column in places:
             moved[row, column, 0] += 1.5
@@ -83,6 +83,15 @@ def test_a_vibration_that_moves_whole_rows_costs_no_corner(yaw):
         waves = torch.sin(2 * torch.pi * travel[..., None] / torch.tensor([233.0, 97.0, 61.0]).double() + phase)
         grid[..., 0] += 1.8 * waves.sum(-1)  # 0.6 mm rms in pixels of 0.28 mm
         assert in_line_with_neighbours(grid, ALL).all()
+
+
+def test_a_wrong_corner_beside_a_hidden_one_at_the_rim():
+    grid, valid = curved_grid(), ALL.clone()
+    valid[5] = False
+    grid[0, 6] += 3.0
+    kept = in_line_with_neighbours(grid, valid)
+    assert not kept[6]
+    assert int(kept.sum()) == 86
 
 
 def test_missing_neighbours_cost_no_corner():
