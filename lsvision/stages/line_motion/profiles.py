@@ -7,7 +7,6 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from lsvision.geometry import ProductFrame, depth_sigma, slope_at, zero_disparity_mm
-from lsvision.stages.line_motion.config import LineMotionConfig
 from lsvision.types import Depth
 
 _DISPARITY_SIGMA_PX = 0.09  # of a depth that comes without its own; the noise's true scale is estimated
@@ -27,15 +26,17 @@ class LineSamples:
     columns: Int[Tensor, " columns"]
 
     @classmethod
-    def of(cls, depth: Depth, frame: ProductFrame, config: LineMotionConfig) -> "LineSamples":
-        """All columns of some lines."""
-        z0, (low, high) = zero_disparity_mm(frame.rig), config.height_range_mm
-        z = depth.z.double()
+    def of(
+        cls, depth: Depth, frame: ProductFrame, height_range_mm: tuple[float, float], columns: slice
+    ) -> "LineSamples":
+        """Some columns of some lines."""
+        z0, (low, high) = zero_disparity_mm(frame.rig), height_range_mm
+        z = depth.z[:, columns].double()
         z = z.masked_fill(~((z >= z0 - high) & (z <= z0 - low)), torch.nan)
         given = depth.sigma
-        sigma = depth_sigma(frame.rig, z, _DISPARITY_SIGMA_PX) if given is None else given.double()
-        columns = torch.arange(z.shape[1])
-        return cls(z, sigma, slope_at(frame.rig, columns.double()), columns)
+        sigma = depth_sigma(frame.rig, z, _DISPARITY_SIGMA_PX) if given is None else given[:, columns].double()
+        numbers = torch.arange(depth.z.shape[1])[columns]
+        return cls(z, sigma, slope_at(frame.rig, numbers.double()), numbers)
 
     def on(self, columns: slice) -> "LineSamples":
         """Those of some columns."""
