@@ -7,7 +7,7 @@ in a state, ``nis``, ``fisher_information`` and ``marginal_information`` for che
 functions that all of them use, and the rule on bits.
 """
 
-from lsvision.estimation.consistency import mean_chi_square_band, nees, nis
+from lsvision.estimation.consistency import chi_square_tail, mean_chi_square_band, nees, nis
 from lsvision.estimation.cubature import AffineModel, slr
 from lsvision.estimation.derivative import jacobian
 from lsvision.estimation.filtering import StateSpace, Track, Update, filter_sequence, predict, update
@@ -47,6 +47,7 @@ __all__ = [
     "Track",
     "Update",
     "apply",
+    "chi_square_tail",
     "cramer_rao_bound",
     "filter_sequence",
     "filter_signals",

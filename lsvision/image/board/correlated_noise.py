@@ -13,42 +13,33 @@ import math
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 _SCALES_PX = (1.0, 2.0, 4.0)  # of the correlations of neighbouring pixels
-# An undersampled or sharpened edge is off by another amount at every pixel. Along an edge these errors are spread
-# evenly and mostly cancel: on scans of two renderers with few samples a pixel, a fifth of their variance reaches the
-# corner.
-_SHARE_OF_EDGES = 0.2
 _LARGEST_CORRELATION = 0.999
 _TRACED = 12  # windows of a board from which the expectation is taken: they are much alike
 
 
 @dataclass(frozen=True)
 class Residuals:
-    """What fits have left of square windows, ``pixels = size²``, and how their parameters follow from the pixels.
+    """What fits have left of square windows, ``pixels = size²``, and how their corners follow from the pixels.
 
-    ``jacobian`` is the derivative of the window by the parameters, of which the first two are the corner; it,
-    ``weight`` and ``residual`` are 0 at pixels that are not fitted. ``inverse_normal`` is that of ``J Jᵀ``; ``corner``
-    is (u, v) from the middle of the window, px.
+    The residual is orthogonal to the ``jacobian``, the derivative of the window by the parameters, of which the first
+    two are the corner; all are 0 at pixels that are not fitted, where the ``weight`` is 0. ``influence`` is the shift of
+    the corner by the noise of each pixel, ``corner`` is (u, v) from the middle of the window, px.
     """
 
     residual: Float[Tensor, "fits pixels"]
     weight: Float[Tensor, "fits pixels"]
     jacobian: Float[Tensor, "fits parameters pixels"]
-    inverse_normal: Float[Tensor, "fits parameters parameters"]
+    influence: Float[Tensor, "fits 2 pixels"]
     corner: Float[Tensor, "fits 2"]
 
     @property
     def size(self) -> int:
         """Pixels across a window."""
         return math.isqrt(self.residual.shape[-1])
-
-    @property
-    def influence(self) -> Float[Tensor, "fits 2 pixels"]:
-        """Shift of the corner by the noise of each pixel."""
-        return self.inverse_normal[:, :2] @ self.jacobian
 
     @property
     def steepness(self) -> Float[Tensor, "fits pixels"]:
@@ -63,7 +54,7 @@ class Residuals:
     def of(self, fits: Tensor | slice) -> "Residuals":
         """Some of the fits."""
         return Residuals(
-            self.residual[fits], self.weight[fits], self.jacobian[fits], self.inverse_normal[fits], self.corner[fits]
+            self.residual[fits], self.weight[fits], self.jacobian[fits], self.influence[fits], self.corner[fits]
         )
 
     def cropped(self, size: int) -> "Residuals":
@@ -74,7 +65,7 @@ class Residuals:
             self.residual[:, inner],
             self.weight[:, inner],
             self.jacobian[..., inner],
-            self.inverse_normal,
+            self.influence[..., inner],
             self.corner,
         )
 
@@ -126,15 +117,42 @@ class Correlation:
         return Correlation(self.along_v[:, fits], self.along_u[:, fits], self.first[:, fits], self.second[:, fits])
 
 
-def corner_covariance(first: Residuals, second: Residuals) -> Float[Tensor, "fits 2 2"]:
-    """Covariance of the errors of corners in one image with those of the same corners in another, px².
+@dataclass(frozen=True)
+class BoardNoise:
+    """What the fits of a board have left of its windows, and the variance of each kind of noise in it."""
+
+    residuals: Residuals
+    strength: Float[Tensor, " kinds"]
+
+    @classmethod
+    def of(cls, residuals: Residuals, valid: Bool[Tensor, " fits"]) -> "BoardNoise":
+        """Noise of the valid fits."""
+        seen = residuals.of(valid)
+        return cls(residuals, noise_strength(seen, seen))
+
+    def covariance(self, fits: Bool[Tensor, " fits"]) -> Float[Tensor, "some 2 2"]:
+        """Covariance of the errors of some corners, px²."""
+        residuals = self.residuals.of(fits)
+        return corner_covariance(residuals, residuals, self.strength)
+
+    def covariance_with(self, other: "BoardNoise", fits: Bool[Tensor, " fits"]) -> Float[Tensor, "some 2 2"]:
+        """Covariance, px², of the errors of some corners with those of the same corners in another image.
+
+        What two images share is at most what either has: estimates of all three may contradict. How undersampled edges
+        fall between the pixels is another matter in each image: none of that is shared.
+        """
+        first, second = _of_one_size(self.residuals.of(fits), other.residuals.of(fits))
+        shared = torch.minimum(noise_strength(first, second), (self.strength * other.strength).sqrt())
+        shared[-1] = 0
+        return corner_covariance(first, second, shared)
+
+
+def noise_strength(first: Residuals, second: Residuals) -> Float[Tensor, " kinds"]:
+    """Variance of each kind of noise, of one image or of what two images share, from what the fits have left.
 
     Args:
-        first, second: fits of the same corners; both the same for the covariance within an image.
+        first, second: fits of the same corners in windows of one size; both the same for the noise within an image.
     """
-    if first.size != second.size:
-        size = min(first.size, second.size)
-        first, second = first.cropped(size), second.cropped(size)
     # Sums over thousands of pixels: seven digits are plenty, and half the time.
     correlation = Correlation.between(first, second, torch.float32)
     left, right = first.residual.float(), second.residual.float()
@@ -143,10 +161,32 @@ def corner_covariance(first: Residuals, second: Residuals) -> Float[Tensor, "fit
     some = first.of(every)
     others = some if first is second else second.of(every)
     expected = expected_products(some, others, correlation.of(every)).to(first.residual)
-    strength = nonnegative_solution(expected, found * (len(left[every]) / len(left)))
-    strength[-1] *= _SHARE_OF_EDGES
-    moved = correlation.times(second.influence.float()).to(first.residual)
-    return torch.einsum("k, fip, kfjp -> fij", strength, first.influence, moved)
+    return nonnegative_solution(expected, found * (len(left[every]) / len(left)))
+
+
+def corner_covariance(
+    first: Residuals, second: Residuals, strength: Float[Tensor, " kinds"]
+) -> Float[Tensor, "fits 2 2"]:
+    """Covariance of the errors of corners in one image with those of the same corners in another, px².
+
+    An undersampled or sharpened edge is off by another amount at every pixel. These errors are spread evenly along the
+    edge and cancel, but for about one pixel's at either end of the window: that share of their variance remains.
+
+    Args:
+        first, second: fits of the same corners in windows of one size; both the same for the covariance within an image.
+        strength: variance of each kind of noise.
+    """
+    remaining = strength.clone()
+    remaining[-1] *= 2 / first.size
+    moved = Correlation.between(first, second, torch.float32).times(second.influence.float()).to(first.residual)
+    return torch.einsum("k, fip, kfjp -> fij", remaining, first.influence, moved)
+
+
+def _of_one_size(first: Residuals, second: Residuals) -> tuple[Residuals, Residuals]:
+    if first.size == second.size:
+        return first, second
+    size = min(first.size, second.size)
+    return first.cropped(size), second.cropped(size)
 
 
 def possible_covariance(

@@ -15,7 +15,9 @@ _LEAST_RESIDUAL_EXCESS, _EXCESS_SPREADS = 0.35, 6.0
 _CLIPPED_LEVEL = 0.998  # of the largest number that the pixels can have
 _CLIPPED_APART = 0.15  # share of a window's pixels, from the board's median: white squares with a bright rim are sound
 _OUT_OF_LINE_SPREADS, _OUT_OF_LINE_PX = 12.0, 0.5  # perspective and lenses bend rows at the rim
+_TELLS, _AGREES = 2.0, 0.5  # neighbours along one axis: their spread over that of all; share of the limit to agree
 _FEWEST_IN_LINE = 12
+_ALONG_X, _ALONG_Y = (0, 1), (1, 0)  # steps (down, right) of a grid
 _NORMAL = 1.4826  # standard deviation of a normal distribution over its median absolute deviation
 
 
@@ -54,41 +56,66 @@ def in_line_with_neighbours(
     """Valid corners that lie where their neighbours on the board expect them.
 
     Each is compared with the median of what pairs of neighbours say, on both of its sides or on one. What is too far
-    follows from the board itself: under vibration all corners are out of line.
+    follows from the board itself: under vibration all corners are out of line. It moves whole lines of the scan, and
+    with them whole rows of a board: a corner stays where neighbours along one axis, which tell as much as all, expect
+    it, and one that is between neighbours along one axis only may be out of line by as much as those beside it.
     """
     if int(valid.sum()) < _FEWEST_IN_LINE:
         return valid
     seen = valid.reshape(grid.shape[:2])
     node = torch.stack(torch.meshgrid(*(torch.arange(n).to(grid) for n in grid.shape[:2]), indexing="ij"), dim=-1)
     bent = grid - QuadraticMap.fitted(node[seen], grid[seen])(node)
-    bent = torch.where(seen[..., None], bent, torch.nan)
-    apart = (bent - _expected(bent)).reshape(-1, 2).abs()
-    spread = _NORMAL * apart.nanmedian(0).values
-    limit = _OUT_OF_LINE_SPREADS * torch.where(torch.isfinite(spread), spread, torch.inf) + _OUT_OF_LINE_PX
-    return valid & ~(apart > limit).any(-1)
+    apart = _apart(torch.where(seen[..., None], bent, torch.nan))
+    known, spread, limit = apart.isfinite(), _spread(apart), _limit(apart)
+    far_beside = _too_far(torch.stack([apart[1] - _beside(apart[1], _ALONG_Y), apart[2] - _beside(apart[2], _ALONG_X)]))
+    wrong = _too_far(apart)[0]
+    for axis, other in ((1, 2), (2, 1)):
+        agrees = (apart[axis].abs() <= _AGREES * limit[axis]) & (spread[axis] < _TELLS * spread[0])
+        wrong = wrong & ~agrees
+        wrong = torch.where(known[axis] & ~known[other], far_beside[axis - 1], wrong)
+    return valid & ~wrong.any(-1).flatten()
 
 
-def _expected(bent: Tensor) -> Tensor:
-    """Median of what the neighbours along both axes say of each place; NaN where it is between none of them.
+def _apart(bent: Float[Tensor, "rows columns 2"]) -> Float[Tensor, "3 rows columns 2"]:
+    """How far each place is from the median of what all its neighbours, those along X and those along Y say.
 
-    A corner of the board itself could only be extrapolated: uneven travel would look like an error.
+    NaN where it is between none of them: a corner of the board itself could only be extrapolated, and uneven travel
+    would look like an error.
     """
-    padded = F.pad(bent, (0, 0, 2, 2, 2, 2), value=torch.nan)
-    rows, columns = bent.shape[:2]
+    said, by_axis = [], []
+    for axis in (_ALONG_X, _ALONG_Y):
+        before_2, before, after, after_2 = (_shifted(bent, axis, step) for step in (-2, -1, 1, 2))
+        said.append(torch.stack([(before + after) / 2, 2 * before - before_2, 2 * after - after_2]))
+        complete = said[-1].isfinite().all(0)
+        by_axis.append(torch.where(complete, said[-1].median(0).values, said[-1][0]))
+    between = by_axis[0].isfinite() | by_axis[1].isfinite()
+    by_all = torch.where(between, torch.cat(said).nanmedian(0).values, torch.nan)
+    return bent - torch.stack([by_all, *by_axis])
 
-    def beside(down: int, right: int) -> Tensor:
-        return padded[2 + down : 2 + down + rows, 2 + right : 2 + right + columns]
 
-    said = []
-    for down, right in ((0, 1), (1, 0)):
-        before, after = beside(-down, -right), beside(down, right)
-        said += [
-            (before + after) / 2,
-            2 * before - beside(-2 * down, -2 * right),
-            2 * after - beside(2 * down, 2 * right),
-        ]
-    between = said[0].isfinite() | said[3].isfinite()
-    return torch.where(between, torch.stack(said).nanmedian(0).values, torch.nan)
+def _beside(values: Float[Tensor, "rows columns 2"], axis: tuple[int, int]) -> Float[Tensor, "rows columns 2"]:
+    """Median of the values up to two places off along an axis."""
+    return torch.stack([_shifted(values, axis, step) for step in (-2, -1, 1, 2)]).nanmedian(0).values
+
+
+def _shifted(values: Float[Tensor, "rows columns 2"], axis: tuple[int, int], step: int) -> Tensor:
+    """The values some places, at most two, further along an axis; NaN beyond the rim."""
+    padded = F.pad(values, (0, 0, 2, 2, 2, 2), value=torch.nan)
+    down, right = 2 + step * axis[0], 2 + step * axis[1]
+    return padded[down : down + values.shape[0], right : right + values.shape[1]]
+
+
+def _spread(apart: Float[Tensor, "tests rows columns 2"]) -> Float[Tensor, "tests 1 1 2"]:
+    spread = _NORMAL * apart.abs().flatten(1, 2).nanmedian(1).values
+    return spread.nan_to_num(torch.inf)[:, None, None]
+
+
+def _too_far(apart: Float[Tensor, "tests rows columns 2"]) -> Bool[Tensor, "tests rows columns 2"]:
+    return apart.abs() > _limit(apart)
+
+
+def _limit(apart: Float[Tensor, "tests rows columns 2"]) -> Float[Tensor, "tests 1 1 2"]:
+    return _OUT_OF_LINE_SPREADS * _spread(apart) + _OUT_OF_LINE_PX
 
 
 def _median(values: Tensor, valid: Tensor) -> Tensor:

@@ -6,11 +6,12 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from lsvision.image.board.correlated_noise import Residuals, corner_covariance, possible_covariance
+from lsvision.image.board.correlated_noise import BoardNoise, possible_covariance
 from lsvision.image.board.outliers import evenly_clipped, in_line_with_neighbours, like_the_board
 from lsvision.image.board.saddle import SaddleOptions, fit_saddles
 from lsvision.image.brightness import gray
-from lsvision.types import LineImage
+from lsvision.image.missing import missing_mask, missing_near
+from lsvision.types import LineImage, missing_ranges
 
 _READ_LINES = 512
 _MODEL_PX = 0.001  # a pixel's box is no Gaussian: the error that a sharp image without noise or texture leaves
@@ -22,13 +23,13 @@ _FEWEST_PIXELS = 49  # of the squares in a window
 class DetectedCorners:
     """Corners of one board in one image, in the board's order: (column, line) px, covariance px², valid or not.
 
-    ``residuals`` is what the fits left of their windows, where it is known.
+    ``noise`` is what the fits left of their windows, where it is known.
     """
 
     position: Float[Tensor, "corners 2"]
     covariance: Float[Tensor, "corners 2 2"]
     valid: Bool[Tensor, " corners"]
-    residuals: Residuals | None = None
+    noise: BoardNoise | None = None
 
     def covariance_with(self, other: "DetectedCorners") -> Float[Tensor, "corners 2 2"]:
         """Covariance, px², of the errors in this image with those of the same corners in another.
@@ -36,11 +37,9 @@ class DetectedCorners:
         Both images show the texture of the board: much of their error is the same.
         """
         covariance = torch.zeros_like(self.covariance)
-        if self.residuals is None or other.residuals is None:
-            return covariance
         both = self.valid & other.valid
-        if bool(both.any()):
-            mixed = corner_covariance(self.residuals.of(both), other.residuals.of(both))
+        if self.noise is not None and other.noise is not None and bool(both.any()):
+            mixed = self.noise.covariance_with(other.noise, both)
             covariance[both] = possible_covariance(mixed, self.covariance[both], other.covariance[both])
         return covariance
 
@@ -99,19 +98,24 @@ def refine_grid(
         valid = evenly_clipped(windows, mask, valid)
         valid = in_line_with_neighbours((centre + fit.position).reshape(grid.shape), valid)
     covariance = torch.full_like(fit.covariance, torch.nan)
+    noise = None
     if plain:
         covariance[valid] = fit.covariance[valid]
     elif bool(valid.any()):
-        residuals = fit.residuals.of(valid)
-        covariance[valid] = corner_covariance(residuals, residuals) + _MODEL_PX**2 * torch.eye(2).to(windows)
+        noise = BoardNoise.of(fit.residuals, valid)
+        covariance[valid] = noise.covariance(valid) + _MODEL_PX**2 * torch.eye(2).to(windows)
     position = torch.where(valid[:, None], centre + fit.position, torch.nan)
-    return DetectedCorners(position, covariance, valid, fit.residuals)
+    return DetectedCorners(position, covariance, valid, noise)
 
 
 def lies_within(image: LineImage, centre: Int[Tensor, "corners 2"], radius: int) -> Bool[Tensor, " corners"]:
-    """Whether the square windows around (column, line) lie within an image."""
+    """Whether the square windows around (column, line) lie within an image, and none of their lines is missing."""
     lines, width, _ = image.shape
-    return ((centre >= radius) & (centre < torch.tensor([width, lines]) - radius)).all(-1)
+    inside = ((centre >= radius) & (centre < torch.tensor([width, lines]) - radius)).all(-1)
+    if missing_ranges(image):
+        spoiled = missing_near(missing_mask(image, torch.arange(lines)), radius)
+        inside &= ~spoiled[centre[:, 1].clamp(0, lines - 1)]
+    return inside
 
 
 def read_windows(

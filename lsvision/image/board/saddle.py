@@ -10,7 +10,15 @@ from torch import Tensor
 
 from lsvision.image.board.correlated_noise import Residuals
 from lsvision.image.board.levenberg_marquardt import Linearisation, NormalMatrix, Windows, fit_parameters
-from lsvision.image.board.saddle_model import FULL, PARAMETERS, PLAIN, POSITION, Saddle, SaddleParameters
+from lsvision.image.board.saddle_model import (
+    FULL,
+    PARAMETERS,
+    PIXEL_VARIANCE,
+    PLAIN,
+    POSITION,
+    Saddle,
+    SaddleParameters,
+)
 
 _TOGETHER = 2**18  # values of a Jacobian that stay in the processor's cache
 # The corner of the plain saddle only starts the full one, whose corner is measured.
@@ -91,15 +99,30 @@ def _fit_together(windows: Windows, angles: Tensor, options: SaddleOptions) -> S
     fitted = Linearisation.of(windows, parameters, FULL)
     variance = fitted.cost / (windows.weight.sum(-1) - PARAMETERS).clamp(min=1)
     inverse_normal = NormalMatrix.of(fitted.jacobian).inverse()
+    influence = inverse_normal[:, POSITION] @ fitted.jacobian
     return SaddleFit(
         position=parameters.position,
         covariance=inverse_normal[:, POSITION, POSITION] * variance[:, None, None],
-        residuals=Residuals(fitted.residual, windows.weight, fitted.jacobian, inverse_normal, parameters.position),
-        blur_px=parameters.blur,
+        residuals=_without_other_shapes(windows, parameters, fitted, influence),
+        blur_px=(parameters.blur.square() + PIXEL_VARIANCE).sqrt(),
         contrast=parameters.contrast.abs(),
         residual=variance.sqrt(),
         valid=windows.complete & _is_corner(parameters, variance.sqrt(), windows, options),
     )
+
+
+def _without_other_shapes(
+    windows: Windows, parameters: SaddleParameters, fitted: Linearisation, influence: Tensor
+) -> Residuals:
+    """Residuals less the differences of real pictures from the model, which are no noise.
+
+    They are not fitted with the corner: in sharp windows that would let noise move it further.
+    """
+    shapes = Saddle.on_grid(parameters, windows.grid).other_shapes() * windows.weight[:, None]
+    jacobian = torch.cat([fitted.jacobian, shapes], dim=1)
+    amount = NormalMatrix.of(jacobian).inverse() @ (jacobian @ fitted.residual[..., None])
+    residual = fitted.residual - (jacobian.mT @ amount)[..., 0]
+    return Residuals(residual, windows.weight, jacobian, influence, parameters.position)
 
 
 def _start(windows: Windows, angles: Tensor) -> SaddleParameters:

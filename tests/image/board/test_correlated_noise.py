@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from lsvision.image.board.correlated_noise import (
+    BoardNoise,
     Correlation,
     Residuals,
     corner_covariance,
@@ -23,9 +24,9 @@ SIZE = 7
 def random_residuals(fits: int = 3) -> Residuals:
     weight = (torch.rand(fits, SIZE**2) > 0.2).double()
     jacobian = torch.randn(fits, 4, SIZE**2, dtype=torch.float64) * weight[:, None]
-    inverse_normal = torch.linalg.inv(jacobian @ jacobian.mT)
+    influence = torch.linalg.inv(jacobian @ jacobian.mT)[:, :2] @ jacobian
     residual = torch.randn(fits, SIZE**2, dtype=torch.float64) * weight
-    return Residuals(residual, weight, jacobian, inverse_normal, torch.rand(fits, 2, dtype=torch.float64) - 0.5)
+    return Residuals(residual, weight, jacobian, influence, torch.rand(fits, 2, dtype=torch.float64) - 0.5)
 
 
 def dense(first: Residuals, second: Residuals, fit: int) -> Tensor:
@@ -42,7 +43,7 @@ def dense(first: Residuals, second: Residuals, fit: int) -> Tensor:
 
 def left_over(fits: Residuals, fit: int) -> Tensor:
     jacobian = fits.jacobian[fit]
-    return fits.weight[fit].diag() - jacobian.mT @ fits.inverse_normal[fit] @ jacobian
+    return fits.weight[fit].diag() - jacobian.mT @ torch.linalg.inv(jacobian @ jacobian.mT) @ jacobian
 
 
 def test_products_equal_those_of_dense_matrices():
@@ -100,8 +101,10 @@ def noisy_fits(count: int, size: int, noise: float, texture: float, width: float
 @pytest.mark.parametrize(("texture", "width"), [(0.0, 1.0), (6.0, 0.5), (6.0, 1.5), (3.0, 3.0)])
 def test_chi_square_of_the_difference_and_the_mean_of_two_images(texture, width):
     left, right = noisy_fits(500, 17, 3.0, texture, width)
-    own = [corner_covariance(fit.residuals, fit.residuals) for fit in (left, right)]
-    shared = possible_covariance(corner_covariance(left.residuals, right.residuals), *own)
+    every = torch.ones(500, dtype=torch.bool)
+    noise = [BoardNoise.of(fit.residuals, every) for fit in (left, right)]
+    own = [each.covariance(every) for each in noise]
+    shared = possible_covariance(noise[0].covariance_with(noise[1], every), *own)
     for error, covariance in (
         (left.position, own[0]),
         (left.position - right.position, own[0] + own[1] - shared - shared.mT),
@@ -116,8 +119,20 @@ def test_chi_square_of_the_difference_and_the_mean_of_two_images(texture, width)
 
 
 def test_windows_of_different_size_are_compared_in_their_middle():
-    left, _ = noisy_fits(20, 17, 3.0, 3.0, 1.5)
-    smaller = left.residuals.cropped(13)
+    left, right = (fit.residuals for fit in noisy_fits(20, 17, 3.0, 3.0, 1.5))
+    smaller = left.cropped(13)
     assert smaller.size == 13
-    assert torch.equal(smaller.residual[0].reshape(13, 13), left.residuals.residual[0].reshape(17, 17)[2:15, 2:15])
-    assert corner_covariance(left.residuals, smaller).isfinite().all()
+    assert torch.equal(smaller.residual[0].reshape(13, 13), left.residual[0].reshape(17, 17)[2:15, 2:15])
+    every = torch.ones(20, dtype=torch.bool)
+    whole, middle = BoardNoise.of(left, every), BoardNoise.of(right.cropped(13), every)
+    torch.testing.assert_close(whole.covariance_with(middle, every), middle.covariance_with(whole, every).mT)
+
+
+def test_what_images_share_is_at_most_what_either_has_and_no_error_of_edges():
+    left, _ = noisy_fits(20, 17, 3.0, 3.0, 1.5)
+    every = torch.ones(20, dtype=torch.bool)
+    noise = BoardNoise(left.residuals, torch.tensor([1.0, 0.5, 0.0, 0.0, 40.0]).double())
+    faint = BoardNoise(left.residuals, torch.tensor([0.25, 2.0, 0.0, 0.0, 40.0]).double())
+    allowed = corner_covariance(left.residuals, left.residuals, torch.tensor([0.5, 1.0, 0.0, 0.0, 0.0]).double())
+    shared = noise.covariance_with(faint, every)
+    assert (torch.linalg.eigvalsh(allowed - shared) > -1e-12).all()

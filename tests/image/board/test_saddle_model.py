@@ -2,21 +2,27 @@
 
 import math
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
-from lsvision.image.board.saddle_model import FULL, PLAIN, Saddle, SaddleParameters
+from lsvision.image.board.saddle_model import FULL, PLAIN, BlurredEdge, Saddle, SaddleParameters
 
 
 def plain_formula(columns: Tensor, grid: Tensor) -> Tensor:
-    """Grey values (pixels) of one saddle of 17 parameters, as the model's docstring writes them."""
+    """Grey values (pixels) of one saddle of 17 parameters, as the model's docstrings write them; boxes by quadrature."""
     u0, v0, angle_1, angle_2, blur = columns[:5]
     u, v = grid
+    node, weight = (torch.from_numpy(part) / 2 for part in np.polynomial.legendre.leggauss(40))
     edges = []
     for angle in (angle_1, angle_2):
-        distance = (u - u0) * torch.cos(angle) + (v - v0) * torch.sin(angle)
-        edges.append(torch.erf(distance / (math.sqrt(2.0) * blur)))
+        cosine, sine = torch.cos(angle), torch.sin(angle)
+        distance = (u - u0) * cosine + (v - v0) * sine
+        width = torch.maximum(cosine.abs(), sine.abs())
+        total = (blur**2 + torch.minimum(cosine.abs(), sine.abs()) ** 2 / 12).sqrt()
+        spread = distance[:, None] + width * node
+        edges.append(torch.erf(spread / (math.sqrt(2.0) * total)) @ weight)
     levels = [a + b * u + c * v for a, b, c in columns[5:].reshape(4, 3)]
     return levels[0] + levels[1] * edges[0] + levels[2] * edges[1] + levels[3] * edges[0] * edges[1]
 
@@ -35,15 +41,36 @@ def grid() -> Tensor:
 
 
 def test_values_by_hand():
-    # Edges along the axes, blur 1, contrast 10 on 50 with slope 2 along u: at one blur right of and below the corner
-    # both edges are erf(1 / sqrt 2), the share of a normal distribution within one sigma. Right of the first edge lies
-    # another 4, more of it further down.
-    parameters = torch.tensor([[0.5, -0.25, 0.0, math.pi / 2, 1.0, 50, 2, 0, 4, 0, 1, 0, 0, 0, 10, 0, 0]]).double()
-    grid = torch.tensor([[1.5, 0.5], [0.75, -0.25]]).double()
+    # Sharp edges along the axes, contrast 10 on 50 with slope 2 along u. The first pixel lies a quarter of a pixel right
+    # of one edge and a tenth below the other: three quarters less one quarter of it are bright, six tenths less four.
+    # Right of the first edge lies another 4, more of it further down.
+    parameters = torch.tensor([[0.5, -0.25, 0.0, math.pi / 2, 1e-4, 50, 2, 0, 4, 0, 1, 0, 0, 0, 10, 0, 0]]).double()
+    grid = torch.tensor([[0.75, 0.5], [-0.15, -0.25]]).double()
     values = Saddle.on_grid(SaddleParameters(parameters), grid).values()
-    share = 0.6826894921370859
-    expected = torch.tensor([53.0 + (4 + 0.75) * share + 10 * share**2, 51.0]).double()
+    expected = torch.tensor([51.5 + (4 - 0.15) * 0.5 + 10 * 0.5 * 0.2, 51.0]).double()
     torch.testing.assert_close(values[0], expected)
+
+
+@pytest.mark.parametrize("angle", [0.0, 0.1, 0.5, math.pi / 4, 2.0])
+@pytest.mark.parametrize(("blur", "largest"), [(0.3, 5e-3), (0.6, 1e-3)])
+def test_an_edge_is_the_mean_over_a_square_pixel(angle, blur, largest):
+    u = torch.linspace(-2, 2, 41).double()
+    edge = BlurredEdge.through_corner(u[None], 0.3 * u[None], *torch.tensor([[[angle]], [[blur]]]).double())
+    node, weight = (torch.from_numpy(part) / 2 for part in np.polynomial.legendre.leggauss(30))
+    across = (u[:, None, None] + node[:, None]) * math.cos(angle) + (0.3 * u[:, None, None] + node) * math.sin(angle)
+    mean = torch.erf(across / (math.sqrt(2) * blur)) @ weight @ weight
+    assert (edge.value[0] - mean).abs().max() < largest
+
+
+def test_other_shapes_turn_with_the_picture_and_move_no_corner(parameters, grid):
+    # Without gradients the model is the same after half a turn, and its derivative by the corner changes its sign.
+    columns = parameters.columns.clone()
+    columns[:, :2] = 0
+    columns[:, 5:].unflatten(-1, (4, 3))[..., 1:] = 0
+    columns[:, [8, 11]] = 0
+    saddle = Saddle.on_grid(SaddleParameters(columns), grid)
+    shapes, by_corner = saddle.other_shapes(), saddle.jacobian(FULL)[:, :2]
+    assert (shapes @ by_corner.mT).abs().max() < 1e-6 * shapes.norm(dim=-1).max() * by_corner.norm(dim=-1).max()
 
 
 def test_values_are_the_plain_formula(parameters, grid):
