@@ -1,116 +1,14 @@
-"""The command line: compose the configuration, turn it into dataclasses once, run one experiment.
+"""The command line: ``python -m lsvision.run +experiment=paper``."""
 
-``python -m lsvision.run +experiment=paper``
-"""
-
-import logging
-import os
-import sys
-import warnings
-from functools import partial
-from pathlib import Path
-from typing import Any, cast
-
-import hydra
-from hydra.core.hydra_config import HydraConfig
-from hydra.types import RunMode
-from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
-
-from lsvision.errors import ConfigError, LsvisionError
-from lsvision.experiments import EXPERIMENTS
-from lsvision.experiments.command_line import EXPECTED, INTERRUPTED, in_one_line, print_any_letter, quoted
-from lsvision.experiments.hydra_hooks import register_settings
-
-log = logging.getLogger("lsvision")
-
-register_settings()
-
-
-def config_folder() -> Path:
-    """The configs shipped with the package, or those of the checkout it runs from."""
-    package = Path(__file__).parent
-    shipped = package / "_configs"
-    return shipped if shipped.is_dir() else package.parent / "configs"
-
-
-def _run(config: DictConfig) -> None:
-    if config.name not in EXPERIMENTS:
-        raise ConfigError(f"no experiment chosen: add +experiment=NAME with NAME one of {', '.join(EXPERIMENTS)}")
-    import torch  # here, so that --help does not wait for it
-
-    from lsvision.experiments.settings import build_settings
-
-    experiment = EXPERIMENTS[config.name]
-    try:
-        values = cast(dict[str, Any], OmegaConf.to_container(config, resolve=True, throw_on_missing=True))
-    except OmegaConfBaseException as error:
-        raise ConfigError(str(error).splitlines()[0]) from error
-    settings = build_settings(experiment.schema, values)
-    logging.getLogger("tifffile").setLevel(logging.CRITICAL)  # damaged files are reported once, by our own error
-    torch.manual_seed(settings.seed)
-    torch.set_num_threads(settings.threads)
-    experiment.run(settings, Path(HydraConfig.get().runtime.output_dir))
-
-
-@hydra.main(version_base="1.3", config_path=str(config_folder()), config_name="config")
-def _job(config: DictConfig) -> None:
-    """Run the experiment that the configuration names; the trace of a failure goes to the run's log.
-
-    A job of a sweep records its failure instead, and the others go on.
-    """
-    hydra_config = HydraConfig.get()
-    if hydra_config.mode == RunMode.MULTIRUN:
-        from lsvision.experiments.sweep import run_job
-
-        folder = Path(hydra_config.runtime.output_dir)
-        failure = run_job(partial(_run, config), folder, list(hydra_config.overrides.task))
-        if failure is not None:
-            _log_trace_to_file(failure)
-        return
-    try:
-        _run(config)
-    except EXPECTED as error:
-        _log_trace_to_file(error)
-        raise SystemExit(_report(error)) from None
+from lsvision.interruption import interruptible
 
 
 def main() -> None:
-    """Compose the configuration and run; an expected failure is one line and its exit code."""
-    print_any_letter()
-    known, sys.argv = sys.argv, [sys.argv[0]]
-    own_handling = os.environ.get("HYDRA_FULL_ERROR")
-    os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra's errors come here instead of being printed with its search paths
-    try:
-        sys.argv += quoted(known[1:])
-        _job()
-    except EXPECTED as error:
-        raise SystemExit(_report(error)) from None
-    except KeyboardInterrupt as stop:
-        # What was interrupted is not awaited any more: of coroutines and resources left behind, Python would warn after
-        # the one line that the user needs.
-        warnings.simplefilter("ignore")
-        done = str(stop) or "no file is half-written"
-        print(f"interrupted: {done}; run the same command again to go on", file=sys.stderr)
-        raise SystemExit(INTERRUPTED) from None
-    finally:
-        sys.argv = known
-        if own_handling is None:
-            del os.environ["HYDRA_FULL_ERROR"]
+    """Run one command; an expected failure is one line and its exit code, and so is an interruption."""
+    with interruptible():
+        from lsvision.experiments.command import run_command  # takes its time, in which Ctrl-C is a line too
 
-
-def _report(error: BaseException) -> int:
-    print(f"error: {in_one_line(error)}", file=sys.stderr)
-    return error.exit_code if isinstance(error, LsvisionError) else 1
-
-
-def _log_trace_to_file(error: Exception) -> None:
-    """Write an exception's trace to the run's log file, past the console."""
-    trace = (type(error), error, error.__traceback__)
-    record = logging.LogRecord("lsvision", logging.ERROR, __file__, 0, "failed", None, trace)
-    for handler in logging.getLogger().handlers:
-        if isinstance(handler, logging.FileHandler):
-            handler.handle(record)
+        run_command()
 
 
 if __name__ == "__main__":

@@ -1,30 +1,31 @@
 """Shapes are checked while the tests run; every test starts from one seed and one thread."""
 
+import gc
+import signal
 import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import hypothesis
-import jaxtyping
 import pytest
+import torch
+
+from tests.shapes import install_checks
 
 LIBRARY = Path(__file__).parents[1]
 # Not the options (config.py, study.points): the library itself reports a value of a wrong type there.
 STAGES = [
     path for path in (LIBRARY / "lsvision" / "stages").rglob("*.py") if path.name not in ("config.py", "__init__.py")
 ]
-jaxtyping.install_import_hook(
+install_checks(
     [
         "lsvision.geometry",
         "lsvision.estimation",
         "lsvision.image",
         *(f"lsvision.study.{name}" for name in ("map", "runs", "tables")),
         *(".".join(path.relative_to(LIBRARY).with_suffix("").parts) for path in STAGES),
-    ],
-    "beartype.beartype",
+    ]
 )
-
-import torch  # noqa: E402
 
 torch.set_num_threads(1)  # before the fixtures of wider scope; xdist's workers share the processor
 
@@ -36,6 +37,12 @@ hypothesis.settings.load_profile("seeded")
 ONE_THREAD = ("++threads=1",)
 
 SHARED_DATA = Path(__file__).parents[2] / "shared" / "data"
+
+
+def pytest_collection_finish() -> None:
+    """Libraries and tests stay: the garbage collector need not look through them again and again, nor so often."""
+    gc.freeze()
+    gc.set_threshold(10_000, 20, 20)
 
 
 @pytest.fixture(autouse=True)
@@ -61,7 +68,26 @@ def rig():
 
 
 @pytest.fixture
-def command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., int]:
+def quick_reports(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Reports are made whole, but their pictures are empty files: drawing takes most of a small scan's time.
+
+    Tests marked ``drawn`` draw them, and figures in three dimensions from two sides.
+    """
+    from lsvision.report import embedding
+
+    def blank(figure: object, path: Path) -> embedding.Embedded:
+        for kind in ("png", "svg"):
+            path.with_name(f"{path.name}.{kind}").touch()
+        return embedding.Embedded(("data:image/png;base64,",), vector=False)
+
+    if request.node.get_closest_marker("drawn"):
+        monkeypatch.setattr(embedding, "_VIEWS", 2)
+    else:
+        monkeypatch.setattr("lsvision.report.pages.embed", blank)
+
+
+@pytest.fixture
+def command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, quick_reports: None) -> Callable[..., int]:
     """Run ``python -m lsvision.run`` in this process with overrides, in a folder of its own; returns the exit code."""
     from lsvision import run
 
@@ -73,6 +99,10 @@ def command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., in
             run.main()
         except SystemExit as stop:
             return int(stop.code or 0)
+        finally:  # a program ignores signals at its end; the tests go on
+            for number, handler in handlers.items():
+                signal.signal(number, handler)
         return 0
 
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
     return call

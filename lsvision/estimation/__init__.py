@@ -7,7 +7,7 @@ in a state, ``nis``, ``fisher_information`` and ``marginal_information`` for che
 functions that all of them use, and the rule on bits.
 """
 
-from lsvision.estimation.consistency import mean_chi_square_band, nees, nis
+from lsvision.estimation.consistency import chi_square_tail, mean_chi_square_band, nees, nis
 from lsvision.estimation.cubature import AffineModel, slr
 from lsvision.estimation.derivative import jacobian
 from lsvision.estimation.filtering import StateSpace, Track, Update, filter_sequence, predict, update
@@ -23,7 +23,10 @@ from lsvision.estimation.joint import Info, Linearise, Posterior, Rows, iterated
 from lsvision.estimation.least_squares import LeastSquares, levenberg_marquardt
 from lsvision.estimation.linalg import apply, lower_factor, product, solve_upper, upper_root
 from lsvision.estimation.rotation import recentre
+from lsvision.estimation.signal_fit import SignalFit, SignalParameters, fit_signals, log_likelihood
+from lsvision.estimation.signals import NoisyValues, SignalModel, filter_signals, smooth_signals
 from lsvision.estimation.smoothing import smooth
+from lsvision.estimation.state_space_process import Process, matern, oscillation
 
 __all__ = [
     "AffineModel",
@@ -32,31 +35,43 @@ __all__ = [
     "Info",
     "LeastSquares",
     "Linearise",
+    "NoisyValues",
     "Posterior",
     "Prior",
+    "Process",
     "Rows",
+    "SignalFit",
+    "SignalModel",
+    "SignalParameters",
     "StateSpace",
     "Track",
     "Update",
     "apply",
+    "chi_square_tail",
     "cramer_rao_bound",
     "filter_sequence",
+    "filter_signals",
     "fisher_information",
+    "fit_signals",
     "iterated_update",
     "jacobian",
     "levenberg_marquardt",
+    "log_likelihood",
     "lower_factor",
     "marginal_information",
+    "matern",
     "mean_chi_square_band",
     "measurement",
     "nees",
     "nis",
+    "oscillation",
     "predict",
     "principal_directions",
     "product",
     "recentre",
     "slr",
     "smooth",
+    "smooth_signals",
     "solve_upper",
     "update",
     "upper_root",

@@ -17,19 +17,24 @@ from lsvision.stages.calibration.config import CalibrationConfig
 from lsvision.stages.corners.config import CornersConfig
 from lsvision.stages.corners.find import find_corners
 from lsvision.stages.corners.rows import row_difference
-from lsvision.types import Board, BoardCorners, Calibration, Provenance, Scan
+from lsvision.types import Board, BoardCorners, Calibration, MissingLines, Provenance, Scan
 
 log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, kw_only=True)
 class CalibrateSettings(RunSettings):
-    """Options of the experiment; ``output`` is the file to write, ``calibration.json`` in the run's folder if None."""
+    """Options of the experiment; ``output`` is the file to write, ``calibration.json`` in the run's folder if None.
+
+    A scan without some of its frames or Zarr chunks is refused; with ``missing_lines`` "mark" the corners on their
+    lines are not measured.
+    """
 
     scans: list[Text] = field(default_factory=list)
     board: Board
     corners: CornersConfig
     calibration: CalibrationConfig
+    missing_lines: MissingLines = "refuse"
     output: Text | None = None
 
 
@@ -39,7 +44,7 @@ def run_calibrate(settings: CalibrateSettings, folder: Path) -> None:
     Raises:
         UnusableCalibrationError: the calibration is inconsistent or did not converge; its files are written.
     """
-    scans = read_scans(settings.scans)
+    scans = read_scans(settings.scans, settings.missing_lines)
     boards = find_boards(scans, settings.board, settings.corners)
     calibration = calibrate(boards, scans[0].rig, settings.calibration)
     provenance = Provenance(
@@ -57,8 +62,11 @@ def run_calibrate(settings: CalibrateSettings, folder: Path) -> None:
         raise UnusableCalibrationError(str(target), calibration.verdict, calibration.reasons)
 
 
-def read_scans(paths: Sequence[str]) -> list[Scan]:
+def read_scans(paths: Sequence[str], missing_lines: MissingLines = "refuse") -> list[Scan]:
     """Open scans and check that all have the same rig.
+
+    Args:
+        missing_lines: with "mark" scans may lack lines.
 
     Raises:
         ConfigError: the list is empty.
@@ -66,10 +74,13 @@ def read_scans(paths: Sequence[str]) -> list[Scan]:
     """
     if not paths:
         raise ConfigError("scans: the list is empty; give at least one scan folder, scans=[DIR,DIR,...]")
-    scans = [read_scan(path) for path in paths]
+    scans = [read_scan(path, missing_lines=missing_lines) for path in paths]
     for scan in scans[1:]:
         if scan.rig != scans[0].rig:
             raise CalibrationError(f"{scan.path}: another rig than that of {scans[0].path}; calibrate each rig alone")
+    for scan in scans:
+        if scan.missing:
+            log.warning("%s: %d of %d lines are missing: no corners there", scan.path, scan.missing_lines, scan.lines)
     return scans
 
 

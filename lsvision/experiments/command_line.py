@@ -11,7 +11,6 @@ from lsvision.errors import ConfigError, LsvisionError
 
 # Expected failures: what is wrong with data, files, the disk or the command; anything else is a fault of the program.
 EXPECTED = (LsvisionError, HydraException, OmegaConfBaseException, OSError)
-INTERRUPTED = 130  # exit code after Ctrl-C, as shells have it
 
 _VALUE = re.compile(r"(?P<key>[~+]*[\w./@]+=)(?P<value>[^'\"({]*[^\x00-\x7f][^'\"({]*)")
 

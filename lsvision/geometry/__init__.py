@@ -22,9 +22,18 @@ from lsvision.geometry.camera import (
     triangulation_jacobian,
     zero_disparity_mm,
 )
+from lsvision.geometry.line_motion import (
+    LineAxes,
+    line_axes,
+    shaken,
+    steadied,
+    steadied_jacobian,
+    uneven_travel,
+    without_trend,
+)
 from lsvision.geometry.motion import displace, line_at, scan_position, travel_at, travel_sigma
-from lsvision.geometry.product import (
-    ProductFrame,
+from lsvision.geometry.product import ProductFrame
+from lsvision.geometry.product_axes import (
     aligned_rotation,
     from_product,
     motion_sigma,
@@ -45,6 +54,7 @@ __all__ = [
     "Camera",
     "CoplanarRig",
     "Intersection",
+    "LineAxes",
     "ProductFrame",
     "aligned_rotation",
     "camera_center_mm",
@@ -60,6 +70,7 @@ __all__ = [
     "from_product",
     "left_jacobian",
     "line_at",
+    "line_axes",
     "middle_point",
     "motion_sigma",
     "object_pitch_mm",
@@ -69,8 +80,11 @@ __all__ = [
     "rotation_from_vector",
     "scaled_rig",
     "scan_position",
+    "shaken",
     "sharp_depth_mm",
     "slope_at",
+    "steadied",
+    "steadied_jacobian",
     "to_product",
     "transform",
     "travel_at",
@@ -78,6 +92,8 @@ __all__ = [
     "triangulate",
     "triangulate_general",
     "triangulation_jacobian",
+    "uneven_travel",
     "vector_from_rotation",
+    "without_trend",
     "zero_disparity_mm",
 ]

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 from mpl_toolkits.mplot3d import Axes3D
 from PIL import Image
@@ -28,7 +29,9 @@ class Embedded:
 
 def embed(figure: Figure, path: Path) -> Embedded:
     """Save a figure as ``path`` with the endings .png and .svg, and return the pictures that a page shows."""
-    png, svg = _saved(figure, "png"), _saved(figure, "svg")
+    canvas = _drawn(figure)
+    figure.set_layout_engine("none")  # it is laid out: the next drawings keep that
+    png, svg = _encoded(canvas, "png"), _as_svg(figure)
     path.with_name(f"{path.name}.png").write_bytes(png)
     path.with_name(f"{path.name}.svg").write_bytes(svg)
     solid = [axes for axes in figure.axes if isinstance(axes, Axes3D)]
@@ -41,23 +44,31 @@ def embed(figure: Figure, path: Path) -> Embedded:
 
 def _views(figure: Figure, solid: list[Axes3D]) -> list[bytes]:
     """Views of a figure turned in equal steps about the vertical, from its present view on."""
-    figure.set_layout_engine("none")  # keep the layout: if every view had its own, the figure would jump
-    figure.set_dpi(_DPI)
-    canvas = FigureCanvasAgg(figure)
     views = []
     for _ in range(_VIEWS):
-        canvas.draw()  # savefig would draw every view twice
-        buffer = io.BytesIO()
-        Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3]).save(buffer, "webp", quality=_VIEW_QUALITY)
-        views.append(buffer.getvalue())
+        views.append(_encoded(_drawn(figure), "webp", quality=_VIEW_QUALITY))
         for axes in solid:
             axes.view_init(elev=axes.elev, azim=axes.azim + 360 / _VIEWS)
     return views
 
 
-def _saved(figure: Figure, kind: str) -> bytes:
+def _drawn(figure: Figure) -> FigureCanvasAgg:
+    """A figure as pixels. ``savefig`` would lay it out and draw it twice."""
+    figure.set_dpi(_DPI)
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    return canvas
+
+
+def _encoded(canvas: FigureCanvasAgg, kind: str, **options: int) -> bytes:
     buffer = io.BytesIO()
-    figure.savefig(buffer, format=kind, dpi=_DPI, metadata={"Date": None} if kind == "svg" else None)
+    Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3]).save(buffer, kind, **options)
+    return buffer.getvalue()
+
+
+def _as_svg(figure: Figure) -> bytes:
+    buffer = io.BytesIO()
+    FigureCanvasSVG(figure).print_svg(buffer, metadata={"Date": None})
     return buffer.getvalue()
 
 

@@ -1,5 +1,6 @@
 """The report of the paper's experiment: its figures and tables redone, its numbers beside ours."""
 
+import math
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -14,28 +15,38 @@ from lsvision.report.calibration_figures import (
     rmse_by_iteration,
     stretch_by_iteration,
 )
-from lsvision.report.paper_scenario import PAPER, Scenario
+from lsvision.report.paper_scenario import PAPER, Scenario, Trial
 from lsvision.report.product_figures import SheetView, height_profile, product_images, sheet_correspondences
 from lsvision.simulation.sheet_points import SheetPoints
 
 
-def write_paper_report(folder: Path, scenarios: Mapping[str, Scenario], settings: dict) -> None:
+def write_paper_report(folder: Path, scenarios: Mapping[str, Scenario], paper_numbers: Trial, settings: dict) -> None:
     """``report.html``: the paper's figures 14-19 redone, its numbers beside ours."""
     still, vibrating = scenarios["still"], scenarios["vibrating"]
-    joint = still.results["joint"]
+    numbers = paper_numbers.result
     page = Page(
         title="Motion distortion of a line-scan stereo camera: Wang et al. 2024 redone",
         lead=(
-            f"{len(still.boards)} tilted boards, a printed sheet and a rail were rendered as scan files, read back, "
-            "calibrated and corrected: once in smooth motion, and once with a vibration, after whose calibration as "
-            "large an error remains as in the paper. The joint calibration uses all boards, the paper's two-step "
-            "method the first one alone."
+            f"{len(still.boards) - 1} tilted boards, a printed sheet and a rail were rendered as scan files, read "
+            "back, calibrated and corrected: once in smooth motion, and once with a vibration. The joint calibration "
+            "uses all these boards, the paper's two-step method the first one alone; a further board checks both. The "
+            "paper measured a machine: its figures compare with those of one board that moves and shakes as they "
+            "suggest, not with boards that move smoothly."
         ),
         headlines=[
-            Headline("RMSE after, no vibration", f"{joint.rmse_after_mm:.4f} mm", "paper: 0.8794 mm"),
+            Headline(
+                "The paper's scheme on a board shaken as in the paper",
+                f"{numbers.rmse_before_mm:.3f} -> {numbers.rmse_after_mm:.4f} mm",
+                "paper, measured: 2.059 -> 0.8794 mm",
+            ),
             *(
-                Headline(f"Improvement with vibration, {method}", f"{100 * result.improvement:.1f} %", "paper: 57.3 %")
-                for method, result in vibrating.results.items()
+                Headline(
+                    f"Board held out, {name}, joint",
+                    f"{scenario.trials['joint'].held_out_mm:.3f} mm",
+                    f"two-step: {scenario.trials['two_step'].held_out_mm:.3f} mm, "
+                    f"nominal motion: {scenario.held_out_before_mm:.2f} mm",
+                )
+                for name, scenario in (("no vibration", still), ("vibration", vibrating))
             ),
             Headline(
                 "Board distances in the product",
@@ -43,29 +54,32 @@ def write_paper_report(folder: Path, scenarios: Mapping[str, Scenario], settings
                 f"as scanned: {max(check.pairs_before_mm for check in still.checks.values()):.2f} mm",
             ),
         ],
-        tables=[methods_table(scenarios), distances_table(scenarios)],
-        figures=[*_calibration_figures(still, vibrating), *_product_figures(still)],
+        tables=[methods_table(scenarios, paper_numbers), distances_table(scenarios)],
+        figures=[*_calibration_figures(still, vibrating, paper_numbers), *_product_figures(still)],
         settings=settings,
     )
     write_report(page, folder)
 
 
-def _calibration_figures(still: Scenario, vibrating: Scenario) -> list[ReportFigure]:
-    """Convergence of both methods in both scenarios; what the boards measured."""
+def _calibration_figures(still: Scenario, vibrating: Scenario, paper_numbers: Trial) -> list[ReportFigure]:
+    """Convergence of both methods in all scenarios; what the boards measured."""
     curves = {
-        f"{method}, {name}": scenario.results[method]
+        f"{method}, {name}": scenario.trials[method].result
         for name, scenario in (("no vibration", still), ("vibration", vibrating))
         for method in ("joint", "two_step")
     }
+    n_true = still.trials["joint"].n_true
     first_board = next(iter(still.boards.values()))
     return [
-        rmse_by_iteration(curves, {"paper, after": PAPER["rmse_after_mm"]}),
-        components_by_iteration(curves, {"truth": still.n_true.tolist()}),
-        stretch_by_iteration(curves, float(still.n_true.norm())),
-        corner_positions(first_board, still.results["joint"]),
+        rmse_by_iteration(
+            {**curves, "two_step, the paper's numbers": paper_numbers.result}, {"paper, after": PAPER["rmse_after_mm"]}
+        ),
+        components_by_iteration(curves, {"truth": n_true.tolist()}),
+        stretch_by_iteration(curves, float(n_true.norm())),
+        corner_positions(first_board, still.trials["joint"].result),
         *(
-            observability_bars(result, name=f"observability_{method}", label=method)
-            for method, result in still.results.items()
+            observability_bars(trial.result, name=f"observability_{method}", label=method)
+            for method, trial in still.trials.items()
         ),
     ]
 
@@ -93,42 +107,47 @@ def _sheet_view(image: Tensor, points: SheetPoints) -> SheetView:
     return SheetView(image, points.true_mm[:, :2], points.measured_mm[:, :2])
 
 
-def methods_table(scenarios: Mapping[str, Scenario]) -> Table:
+def methods_table(scenarios: Mapping[str, Scenario], paper_numbers: Trial) -> Table:
     """The calibrations of all scenarios by all methods, the paper's first."""
-    paper = ("paper", "two-step", "2.059", "0.8794", "57.3 %", "5", "1.0246", "", "", "not stated")
-    rows = [paper]
-    for name, scenario in scenarios.items():
-        for method, result in scenario.results.items():
-            error = (result.motion.n - scenario.n_true).tolist()
-            rows.append(
-                (
-                    name,
-                    method,
-                    f"{result.rmse_before_mm:.4f}",
-                    f"{result.rmse_after_mm:.4f}",
-                    f"{100 * result.improvement:.1f} %",
-                    str(len(result.iterations) - 1),
-                    f"{result.motion.stretch:.5f}",
-                    "  ".join(f"{value:+.1e}" for value in error),
-                    "  ".join(f"{value:.1e}" for value in result.motion.sigma.tolist()),
-                    result.verdict,
-                )
-            )
-    header = (
-        "scenario",
-        "method",
-        "RMSE before [mm]",
-        "after [mm]",
-        "improvement",
-        "iterations",
-        "stretch [mm per mm]",
-    )
+    rows = [
+        ("paper", "measured", "two-step", "2.059", "0.8794", "57.3 %", "5", "1.0246", "", "", "", "not stated"),
+        _row("the paper's numbers", "two_step", paper_numbers),
+        *(
+            _row(name, method, trial)
+            for name, scenario in scenarios.items()
+            for method, trial in scenario.trials.items()
+        ),
+    ]
     return Table(
         "Calibration",
-        (*header, "error of n1, n2, n3 [mm per mm]", "σ of n1, n2, n3 [mm per mm]", "verdict"),
+        (
+            "scenario", "scans", "method", "RMSE before [mm]", "after [mm]", "improvement", "iterations",
+            "stretch [mm per mm]", "board held out [mm]", "error of n1, n2, n3 [mm per mm]",
+            "σ of n1, n2, n3 [mm per mm]", "verdict",
+        ),
         rows,
         "One board cannot distinguish a tilt of the motion in depth from a tilt of the board: in that direction its "
-        "result repeats the prior, however small its RMSE.",
+        "result repeats the prior, however small its RMSE. The board held out is fitted under each method's n, which "
+        "has not seen it. A vibration remains in every RMSE, as a constant n does not describe it.",
+    )  # fmt: skip
+
+
+def _row(scenario: str, method: str, trial: Trial) -> tuple[str, ...]:
+    result = trial.result
+    error = (result.motion.n - trial.n_true).tolist()
+    return (
+        scenario,
+        "simulated",
+        method,
+        f"{result.rmse_before_mm:.4f}",
+        f"{result.rmse_after_mm:.4f}",
+        f"{100 * result.improvement:.1f} %",
+        str(len(result.iterations) - 1),
+        f"{result.motion.stretch:.5f}",
+        "" if math.isnan(trial.held_out_mm) else f"{trial.held_out_mm:.4f}",
+        "  ".join(f"{value:+.1e}" for value in error),
+        "  ".join(f"{value:.1e}" for value in result.motion.sigma.tolist()),
+        result.verdict,
     )
 
 

@@ -15,6 +15,35 @@ from lsvision.types import BoardCorners, Calibration, Scan
 # Wang et al. 2024, section 5: RMSE before and after, its improvement, iterations and stretch.
 PAPER = {"rmse_before_mm": 2.059, "rmse_after_mm": 0.8794, "improvement": 0.573, "iterations": 5, "stretch": 1.0246}
 
+HELD_OUT = "held_out"  # the scan of a board that calibrates nothing
+
+
+@dataclass(frozen=True)
+class Trial:
+    """A calibration of simulated scans, the true motion, and the RMSE of a board that it has not seen, mm."""
+
+    result: Calibration
+    n_true: Tensor
+    held_out_mm: float = math.nan
+
+    def summary(self) -> dict:
+        """Plain values for ``summary.json``."""
+        result = self.result
+        return {
+            "rmse_before_mm": result.rmse_before_mm,
+            "rmse_after_mm": result.rmse_after_mm,
+            "improvement": result.improvement,
+            "iterations": len(result.iterations) - 1,
+            "rmse_by_iteration_mm": [step.rmse_mm for step in result.iterations],
+            "held_out_rmse_mm": self.held_out_mm,
+            "stretch": result.motion.stretch,
+            "n": result.motion.n.tolist(),
+            "n_true": self.n_true.tolist(),
+            "sigma": result.motion.sigma.tolist(),
+            "verdict": result.verdict,
+            "noise_scale": result.noise_scale,
+        }
+
 
 @dataclass(frozen=True)
 class BoardCheck:
@@ -37,10 +66,13 @@ class BoardCheck:
 
 @dataclass(frozen=True)
 class Scenario:
-    """Everything that one scenario produced, by name of the scan or of the method."""
+    """Everything that one scenario produced, by name of the scan or of the method.
 
-    n_true: Tensor
-    results: Mapping[str, Calibration]
+    ``held_out_before_mm`` is the RMSE of the board that was held out under the nominal motion.
+    """
+
+    trials: Mapping[str, Trial]
+    held_out_before_mm: float
     boards: Mapping[str, BoardCorners]
     checks: Mapping[str, BoardCheck]
     sheet_before: SheetPoints
@@ -50,7 +82,7 @@ class Scenario:
 
     def summary(self) -> dict:
         """Plain values for ``summary.json``."""
-        methods = {method: self._method_summary(result) for method, result in self.results.items()}
+        methods = {method: trial.summary() for method, trial in self.trials.items()}
         products = {
             "board_distance_rms_mm": {
                 name: {"corners": check.corners, "before": check.pairs_before_mm, "after": check.pairs_after_mm}
@@ -63,7 +95,7 @@ class Scenario:
                 "points": len(self.sheet_after.shift_px),
             },
         }
-        return {**methods, "products": products}
+        return {**methods, "held_out_rmse_before_mm": self.held_out_before_mm, "products": products}
 
     def image(self, name: str) -> Tensor:
         """The whole left image of a scan."""
@@ -82,16 +114,3 @@ class Scenario:
             return BoardView(color, torch.empty(0, 2))
         origin_y, origin_x = product.origin_mm
         return BoardView(color, (points[:, :2] - torch.tensor([origin_x, origin_y])) / product.pitch_mm)
-
-    def _method_summary(self, result: Calibration) -> dict:
-        return {
-            "rmse_before_mm": result.rmse_before_mm,
-            "rmse_after_mm": result.rmse_after_mm,
-            "improvement": result.improvement,
-            "iterations": len(result.iterations) - 1,
-            "n": result.motion.n.tolist(),
-            "n_true": self.n_true.tolist(),
-            "sigma": result.motion.sigma.tolist(),
-            "verdict": result.verdict,
-            "noise_scale": result.noise_scale,
-        }

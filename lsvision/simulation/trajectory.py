@@ -12,8 +12,9 @@ from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
-from lsvision.geometry import Camera, camera_center_mm, middle_point, slope_at
+from lsvision.geometry import Camera, camera_center_mm, middle_point, shaken, slope_at
 from lsvision.simulation.config import EncoderConfig, MotionConfig
 from lsvision.simulation.noise import lattice_hash
 from lsvision.types import Pose, Rig, Transport
@@ -80,12 +81,9 @@ class Trajectory:
         """Places (x mm, line, z mm), ``(*batch, 3)``, where the object's own points, mm, cross the scan plane."""
         y = points[..., 1].double() / self.n[1]  # neither roll about Y nor dx, dz moves a point along Y
         line = self.line_at(y)
-        dx, dz, roll = self.vibration(line).unbind(-1)
-        x, _, z = (points - y[..., None] * self.n - self.pivot).unbind(-1)
-        cos, sin = torch.cos(roll), torch.sin(roll)
-        return torch.stack(
-            [cos * x + sin * z + self.pivot[0] + dx, line, cos * z - sin * x + self.pivot[2] + dz], dim=-1
-        )
+        still = (points - y[..., None] * self.n)[..., ::2]
+        x, z = shaken(still, pad(self.vibration(line), (0, 1)), self.pivot).unbind(-1)
+        return torch.stack([x, line, z], dim=-1)
 
     def _wobble(self, even: Tensor) -> Tensor:
         if not self.encoder.enabled:

@@ -1,13 +1,14 @@
-"""Products -> figures: what a board measures in a corrected image."""
+"""Boards as a check: what one measures in a corrected image, and how well it fits a motion it had no part in."""
 
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
+from lsvision.geometry import displace, fit_rigid
 from lsvision.image.board.search import search_board
 from lsvision.image.planes import fit_local_planes
-from lsvision.types import Board, LineImage, ProductGrid
+from lsvision.types import Board, BoardCorners, LineImage, ProductGrid
 
 
 @dataclass(frozen=True)
@@ -39,6 +40,14 @@ def measure_board(color: LineImage, height: LineImage, grid: ProductGrid, board:
     points = torch.cat([corners.position * grid.pitch_mm + origin, -level[:, None]], dim=-1)
     neighbour, distance = distance_errors(points, board, seen)
     return BoardMeasurement(torch.where(seen[:, None], points, torch.nan), seen, neighbour, distance)
+
+
+def fitted_rmse_mm(corners: BoardCorners, n: Tensor) -> float:
+    """RMSE of a board's corners under the motion n ``(3,)``, mm, at the pose that fits best."""
+    moved, valid = displace(corners.points, n), corners.valid
+    pose = fit_rigid(corners.board_points, moved, valid)
+    residual = corners.board_points @ pose.rotation.mT + pose.translation - moved
+    return float(residual[valid].square().sum(-1).mean().sqrt())
 
 
 def distance_errors(points: Tensor, board: Board, valid: Tensor) -> tuple[float, float]:

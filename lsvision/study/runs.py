@@ -34,7 +34,7 @@ class PointRuns:
     iterations: Int[Tensor, " runs"]
     converged: Bool[Tensor, " runs"]
     noise_scale: Float[Tensor, " runs"]
-    along_scan_rms_mm: Float[Tensor, "runs 3"]
+    along_scan_rms_mm: Float[Tensor, "runs 4"]
     info: Int[Tensor, " runs"]
 
     @classmethod

@@ -20,6 +20,7 @@ from lsvision.types.calibration import (
     RefusedVerdict,
     Verdict,
 )
+from lsvision.types.line_motion import LINE_COMPONENTS, LineComponent, LineFinding, LineMotion
 from lsvision.types.product import (
     ProductGrid,
     ProductStrip,
@@ -42,6 +43,7 @@ from lsvision.types.scan import (
 )
 
 __all__ = [
+    "LINE_COMPONENTS",
     "Board",
     "BoardCorners",
     "BoardFit",
@@ -52,7 +54,10 @@ __all__ = [
     "DepthView",
     "ErrorAlongScan",
     "Iteration",
+    "LineComponent",
+    "LineFinding",
     "LineImage",
+    "LineMotion",
     "MissingLines",
     "Motion",
     "Observability",

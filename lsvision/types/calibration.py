@@ -98,18 +98,20 @@ class BoardFit:
 class ErrorAlongScan:
     """An error that all corners of a line share, as of vibration or of the encoder, in one component of their points.
 
-    ``length_mm`` is that of a wave along the travel whose correlation falls as fast.
+    Of a turn about the travel (``roll``), ``rms_mm`` is that of what it displaces the corners by. ``length_mm`` is that
+    of a wave along the travel whose correlation falls as fast.
     """
 
-    component: Literal["x", "travel", "z"]
+    component: Literal["x", "travel", "z", "roll"]
     rms_mm: Positive
     length_mm: Positive
 
     @property
     def in_words(self) -> str:
         """What it is, for a reader."""
-        where = {"x": "sideways", "travel": "in the travel", "z": "in depth"}[self.component]
-        return f"errors along the scan: {self.rms_mm:.2g} mm rms {where}, about {self.length_mm:.2g} mm long"
+        words = {"x": "sideways", "travel": "in the travel", "z": "in depth", "roll": "by a turn about the travel"}
+        size = f"{self.rms_mm:.2g} mm rms {words[self.component]}"
+        return f"errors along the scan: {size}, about {self.length_mm:.2g} mm long"
 
 
 @dataclass(frozen=True)

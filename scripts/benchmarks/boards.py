@@ -111,7 +111,7 @@ def _columns_lost(px: Tensor, side: str, squares: float) -> int:
 
 
 def _hidden(whole: View) -> Iterator[View]:
-    """Grey clamps over the middle, the rim and the corners of the board, and glare in its middle; in both images."""
+    """Grey clamps over the middle, the rim and the corners of the board, and glare in its middle, in both images."""
     for corner in (38, 5, 0, 87):
         yield _spoiled(whole, corner, _clamp)
     yield _spoiled(whole, 38, _glare)

@@ -15,9 +15,9 @@ from omegaconf import OmegaConf
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
+from lsvision.experiments.command import config_folder
 from lsvision.experiments.settings import build_settings
 from lsvision.experiments.study import StudySettings
-from lsvision.run import config_folder
 from lsvision.study.points import exact_corners, noise_chol
 from lsvision.study.runs import Sampling, noisy_points, run_points
 

@@ -11,6 +11,7 @@ import zarr
 
 from lsvision.archive import LEDGER_FILE, Ledger, ledger_lines, plan_one, process_one
 from lsvision.errors import FileFormatError
+from lsvision.experiments.calibrate import read_scans
 from lsvision.experiments.correct import CorrectSettings, run_correct
 from lsvision.io import read_product, read_scan
 from tests.archive.archives import PROCESSING, RIG, make_calibration, make_scan, process
@@ -110,3 +111,13 @@ def test_the_option_is_part_of_the_keys(tmp_path):
         product = process_one(plan, processing, tmp_path / "o", lambda task, outcome: None)
         keys.add(read_product(product.path).metadata["key"])
     assert len(keys) == 2
+
+
+def test_scans_of_boards_may_lack_lines_where_that_is_asked_for(tmp_path, caplog):
+    scan = as_frames(make_scan(tmp_path / "a", LINES), "left")
+    (scan / "left" / "4.png").unlink()
+    with pytest.raises(FileFormatError, match="frames 4 are missing"):
+        read_scans([str(scan)])
+    (opened,) = read_scans([str(scan)], "mark")
+    assert opened.missing_lines == FRAME_LINES
+    assert f"{FRAME_LINES} of {LINES} lines are missing: no corners there" in caplog.text

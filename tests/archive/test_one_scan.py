@@ -50,6 +50,9 @@ def reprocess(archive: Path, calibration: Path, output: Path) -> None:
     run_reprocess(settings, output.with_name(f"{output.name}-run"))
 
 
+pytestmark = pytest.mark.usefixtures("quick_reports")
+
+
 def ignore(task: object, outcome: object) -> None:
     pass
 
@@ -165,8 +168,7 @@ def test_a_scan_file_stands_for_its_folder(archive, calibration, tmp_path):
     assert process_one(planned, PROCESSING, tmp_path, ignore).path == tmp_path / "a.zarr"
 
 
-def test_a_repaired_encoder_log_is_stated_and_part_of_sigma(tmp_path, monkeypatch, caplog):
-    monkeypatch.setattr("lsvision.experiments.correct.product_report", lambda *_: None)  # takes seconds
+def test_a_repaired_encoder_log_is_stated_and_part_of_sigma(tmp_path, caplog):
     scan, calibration = make_scan(tmp_path / "a"), make_calibration(tmp_path / "calibration.json")
     line = torch.arange(96).double()
     write_encoder(1.12 * (line + 2 * torch.sin(line / 5)), scan / "encoder.csv")

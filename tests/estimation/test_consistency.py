@@ -2,9 +2,9 @@
 
 import pytest
 import torch
-from scipy.stats import chi2
+from scipy.special import gammaincc, gammaincinv  # scipy.stats takes a second to import
 
-from lsvision.estimation import mean_chi_square_band, nees, nis
+from lsvision.estimation import chi_square_tail, mean_chi_square_band, nees, nis
 from tests.estimation.models import random, random_covariance
 
 
@@ -25,8 +25,15 @@ def test_nis_by_hand():
     assert nis(torch.tensor([3.0, 4.0]).double()).item() == 25.0
 
 
+def test_tail_is_scipys():
+    value = torch.tensor([[0.0], [3.0], [400.0]]).double()
+    expected = gammaincc([0.5, 3.5], value.numpy() / 2)
+    torch.testing.assert_close(chi_square_tail(value, torch.tensor([1, 7])), torch.from_numpy(expected))
+    torch.testing.assert_close(chi_square_tail(value, 7.0)[:, 0], torch.from_numpy(expected[:, 1]))
+
+
 @pytest.mark.parametrize(("freedom", "runs", "probability"), [(9, 400, 0.95), (1, 1, 0.99), (3, 50, 0.9)])
 def test_band_is_scipys(freedom, runs, probability):
     tail = (1 - probability) / 2
-    expected = chi2.ppf([tail, 1 - tail], freedom * runs) / runs
+    expected = 2 * gammaincinv(freedom * runs / 2, [tail, 1 - tail]) / runs
     assert mean_chi_square_band(freedom, runs, probability) == pytest.approx(expected, rel=1e-8)

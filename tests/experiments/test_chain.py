@@ -10,9 +10,9 @@ from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
 from lsvision.experiments import EXPERIMENTS
+from lsvision.experiments.command import config_folder
 from lsvision.experiments.settings import build_settings
 from lsvision.io import read_calibration, read_product, read_scan
-from lsvision.run import config_folder
 from lsvision.stages.measurement import measure_board
 from lsvision.types import Board, DepthView, ProductGrid, TensorImage
 from tests.archive.archives import make_calibration

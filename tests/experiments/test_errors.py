@@ -1,6 +1,5 @@
 """Bad input: one line with the path or the option, exit code 1, nothing half-written."""
 
-import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -12,6 +11,7 @@ import yaml
 
 from lsvision.io import write_rig
 from lsvision.types import Rig
+from tests.archive.archives import make_calibration, make_scan
 
 
 @pytest.fixture
@@ -87,16 +87,22 @@ def test_a_bad_option_is_one_line_that_names_it(overrides, told, command, capsys
     [
         (["+experiment=correct", "scan=x", "calibration=y", "correction.strip_rows=0"], "correction.strip_rows: "),
         (["+experiment=correct", "scan=x", "calibration=y", "export=[obj]"], "export[0]: "),
-        (["+experiment=validate", "product=x", "threads=0"], "threads: "),
         (["+experiment=reprocess", "archive=x", "calibration=y", "output=z", "engine.workers=0"], "engine.workers: "),
     ],
 )
-def test_an_option_out_of_range_ends_the_program_with_one_line(overrides, problem, tmp_path):
-    arguments = [sys.executable, "-m", "lsvision.run", *overrides, f"hydra.run.dir={tmp_path}"]
+def test_an_option_out_of_range_is_one_line(overrides, problem, command, capsys):
+    assert command(*overrides) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith(f"error: {problem}expected ")
+
+
+def test_an_option_out_of_range_ends_the_program_with_one_line(tmp_path):
+    options = ["+experiment=validate", "product=x", "threads=0", f"hydra.run.dir={tmp_path}"]
+    arguments = [sys.executable, "-m", "lsvision.run", *options]
     done = subprocess.run(arguments, cwd=Path(__file__).parents[2], capture_output=True, text=True, timeout=100)
     assert done.returncode == 1
     (line,) = done.stderr.splitlines()
-    assert line.startswith(f"error: {problem}expected ")
+    assert line.startswith("error: threads: expected ")
 
 
 def test_an_unknown_option_fails_naming_it(command, capsys):
@@ -104,11 +110,9 @@ def test_an_unknown_option_fails_naming_it(command, capsys):
     assert "calibration.metod" in capsys.readouterr().err
 
 
-def test_a_calibration_for_another_rig_is_refused(scan, command, capsys, tmp_path, shared_data):
-    other = shared_data / "scans_other_renderer" / "tilt_a"
-    assert command("+experiment=calibrate", f"scans=[{other}]") == 0
-    capsys.readouterr()
-    overrides = ("+experiment=correct", f"scan={scan}", f"calibration={tmp_path / 'run' / 'calibration.json'}")
+def test_a_calibration_for_another_rig_is_refused(scan, command, capsys, tmp_path):
+    other = make_calibration(tmp_path / "other.json")
+    overrides = ("+experiment=correct", f"scan={scan}", f"calibration={other}")
     assert command(*overrides, folder="corrected") == 1
     told = capsys.readouterr().err
     assert str(scan) in told
@@ -116,23 +120,25 @@ def test_a_calibration_for_another_rig_is_refused(scan, command, capsys, tmp_pat
     assert not list((tmp_path / "corrected").glob("*.zarr"))
 
 
-def test_a_product_that_fails_half_way_leaves_nothing(scan, command, tmp_path, monkeypatch, capsys, shared_data):
+def test_a_product_that_fails_half_way_leaves_nothing(command, tmp_path, monkeypatch, capsys):
     from lsvision.errors import LsvisionError
     from lsvision.stages.correction.correct import Correction
 
-    other = tmp_path / "tilt_a"
-    shutil.copytree(shared_data / "scans_other_renderer" / "tilt_a", other)
-    assert command("+experiment=calibrate", f"scans=[{other}]") == 0
+    made = []
 
     def failing(correction, rows):
         if rows[0] > 0:
             raise LsvisionError("the disk is full")
+        made.append(rows)
         return strip(correction, rows)
 
     strip = Correction.strip
     monkeypatch.setattr(Correction, "strip", failing)
-    overrides = ("+experiment=correct", f"scan={other}", f"calibration={tmp_path / 'run' / 'calibration.json'}")
-    assert command(*overrides, "correction.strip_rows=100", folder="corrected") == 1
+    scan, calibration = make_scan(tmp_path / "scan", stereo=True), make_calibration(tmp_path / "calibration.json")
+    overrides = ("+experiment=correct", f"scan={scan}", f"calibration={calibration}")
+    assert command(*overrides, "correction.strip_rows=32", folder="corrected") == 1
+    assert made == [(0, 32)]
+    assert "the disk is full" in capsys.readouterr().err
     assert sorted(path.name for path in (tmp_path / "corrected").iterdir()) == [".hydra", "lsvision.log"]
 
 

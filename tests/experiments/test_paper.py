@@ -4,6 +4,8 @@ import json
 
 import pytest
 
+pytestmark = [pytest.mark.slow, pytest.mark.drawn]
+
 
 def _check(summary, *, sheet_px):
     paper, still, vibrating = summary["paper"], summary["still"], summary["vibrating"]
@@ -19,6 +21,12 @@ def _check(summary, *, sheet_px):
     for method in ("joint", "two_step"):
         assert vibrating[method]["improvement"] >= paper["improvement"]
         assert vibrating[method]["rmse_after_mm"] == pytest.approx(paper["rmse_after_mm"], rel=0.2)
+    for scenario, bound in ((still, 0.06), (vibrating, paper["rmse_after_mm"])):
+        assert scenario["joint"]["held_out_rmse_mm"] < bound < 2.0 < scenario["held_out_rmse_before_mm"]
+    numbers = summary["paper_numbers"]
+    for key in ("rmse_before_mm", "rmse_after_mm", "stretch"):
+        assert numbers[key] == pytest.approx(paper[key], rel=0.003)
+    assert numbers["iterations"] == paper["iterations"]
     products = still["products"]
     for board in products["board_distance_rms_mm"].values():
         assert board["corners"] == 88
@@ -28,7 +36,6 @@ def _check(summary, *, sheet_px):
     assert products["sheet_rms_mm"]["after"] < 0.1 < 1.0 < products["sheet_rms_mm"]["before"]
 
 
-@pytest.mark.slow
 def test_the_paper_at_a_quarter_of_the_pixels(command, tmp_path):
     assert command("+experiment=paper") == 0
     _check(json.loads((tmp_path / "run" / "summary.json").read_text()), sheet_px=1.0)
@@ -36,7 +43,6 @@ def test_the_paper_at_a_quarter_of_the_pixels(command, tmp_path):
     assert not list(tmp_path.rglob("*.partial"))
 
 
-@pytest.mark.slow
 def test_the_paper_at_a_tenth_of_the_pixels(command, tmp_path):
     assert command("+experiment=paper", "scale=10", "vibrating.seed=100") == 0
     _check(json.loads((tmp_path / "run" / "summary.json").read_text()), sheet_px=1.0)

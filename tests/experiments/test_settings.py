@@ -15,8 +15,8 @@ from pydantic import AllowInfNan
 
 from lsvision.errors import ConfigError
 from lsvision.experiments import EXPERIMENTS
+from lsvision.experiments.command import config_folder
 from lsvision.experiments.settings import RunSettings, build_settings, settings_sha256
-from lsvision.run import config_folder
 from lsvision.schema import Checked, Seed, shape_of
 from lsvision.stages.calibration.config import CalibrationConfig
 from lsvision.stages.corners.config import CornersConfig

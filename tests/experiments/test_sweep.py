@@ -8,8 +8,8 @@ import sys
 import polars
 import pytest
 
-from lsvision import run
 from lsvision.errors import CalibrationError
+from lsvision.experiments.command import config_folder
 from lsvision.experiments.sweep import collect_sweep
 from lsvision.io import write_text
 
@@ -32,6 +32,7 @@ def toy(monkeypatch):
     monkeypatch.setattr("lsvision.experiments.study.run_study", experiment)
 
 
+@pytest.mark.drawn
 def test_twelve_jobs_of_which_two_fail(toy, command, tmp_path, capsys):
     folder = tmp_path / "sweep"
     assert command(*SWEEP, f"hydra.sweep.dir={folder}") == 1
@@ -90,7 +91,7 @@ def test_jobs_in_other_processes(launcher, tmp_path):
     options = ["conditions.boards=two_tilted,two_wrong", "axes.boards=null", "runs=2", "map_steps=3", "threads=1"]
     sweep = [f"hydra/launcher={launcher}", f"hydra.sweep.dir={tmp_path / 'sweep'}"]
     command = [sys.executable, "-m", "lsvision.run", "--multirun", "+experiment=study", *options, *sweep]
-    environment = {**os.environ, "PYTHONPATH": str(run.config_folder().parent), "PYTHONWARNINGS": "ignore"}
+    environment = {**os.environ, "PYTHONPATH": str(config_folder().parent), "PYTHONWARNINGS": "ignore"}
     done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 1, done.stderr
     assert "two_wrong" in done.stderr

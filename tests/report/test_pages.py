@@ -113,6 +113,8 @@ def test_calibration_report(tmp_path, determined, corners):
     assert len(list((tmp_path / "figures").glob("*.png"))) == len(list((tmp_path / "figures").glob("*.svg"))) == 7
 
 
+@pytest.mark.drawn
+@pytest.mark.usefixtures("quick_reports")
 @pytest.mark.parametrize("measured", [True, False])
 def test_product_report(tmp_path, measured, dominated):
     height = torch.full((20, 30), 2.5) if measured else torch.full((20, 30), torch.nan)

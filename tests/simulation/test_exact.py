@@ -16,7 +16,7 @@ from lsvision.simulation import (
     SensorConfig,
     simulate,
 )
-from lsvision.types import Pose, Rig
+from lsvision.types import Board, Pose, Rig
 from tests.simulation.corner_fit import fit_corners
 
 SHARED_N = MotionConfig(angle_x_deg=-1.5, angle_z_deg=0.8, stretch=0.985)
@@ -38,7 +38,8 @@ def test_corners_agree_with_the_model_to_a_hundredth_of_a_pixel(small_rig, board
     assert _worst(simulation, whole, board) < 0.01
 
 
-def test_corners_are_exact_at_a_quarter_of_the_pixels(full_rig, board, whole):
+def test_corners_are_exact_at_a_quarter_of_the_pixels(full_rig, whole):
+    board = Board(5, 4, 30.0)
     scene = SceneConfig(pitch_deg=-6.0, roll_deg=4.0, yaw_deg=12.0, board_texture=0.0)
     simulation = simulate(
         scaled_rig(full_rig, 4), board, scene, SHARED_N, SensorConfig(noise=0.0, bits=16), Acquisition(0.28)

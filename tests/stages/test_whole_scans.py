@@ -18,7 +18,7 @@ from lsvision.types import DepthView, Motion, Rig, Scan, TensorImage, Travel
 PITCH = 0.56
 # An eighth of the camera's pixels, and a field of two tiles.
 RIG = Rig(700, 80.0, 113.84, 354.0, 129.8, 761.9)
-LINES = 500
+LINES = 400
 CONFIG = CorrectionConfig(height_range_mm=(-30.0, 30.0), strip_rows=10_000)
 PARTS = ("color", "height", "valid", "source")
 
@@ -55,7 +55,7 @@ OPTIONS = {
     "bicubic": {},
     "bilinear": {"interpolation": "bilinear"},
     "coarser": {"pitch_mm": 1.9 * PITCH},
-    "finer": {"pitch_mm": 0.55 * PITCH},
+    "finer": {"pitch_mm": 0.7 * PITCH},
     "opencv": {"resampler": "opencv", "interpolation": "bilinear"},
 }
 

@@ -5,6 +5,7 @@ import os
 from concurrent.futures import CancelledError
 from contextlib import suppress
 from dataclasses import asdict
+from multiprocessing import resource_tracker
 from pathlib import Path
 from queue import Empty, SimpleQueue
 from types import TracebackType
@@ -17,6 +18,7 @@ from distributed.security import Security
 from lsvision.archive.engines.protocol import MAX_WORKER_CRASHES, WORKERS_CRASHED, Finished, TlsFiles
 from lsvision.archive.tasks import Outcome, Task, run_in_worker
 from lsvision.errors import ConfigError, LsvisionError
+from lsvision.interruption import hidden_from_children, uninterrupted
 
 _POLL_SECONDS = 1.0
 
@@ -57,25 +59,17 @@ class DaskEngine:
         self._settings = dask.config.set(_SETTINGS)
         for name in _LOGGERS:
             logging.getLogger(name).setLevel(logging.CRITICAL)
-        self._cluster, self._workers = None, workers
+        self._workers = workers
+        self._cluster: LocalCluster | None = None
         security = None if tls is None else _security(tls)
-        if scheduler is None:
-            self._cluster = LocalCluster(
-                n_workers=workers,
-                threads_per_worker=1,
-                memory_limit=worker_memory_mb * 2**20 * 2,
-                # Whoever reaches the scheduler or a worker can run any program: nobody from another machine can.
-                host="127.0.0.1",
-                dashboard_address="127.0.0.1:0",
-                silence_logs=50,
-                security=security,
-                protocol=None if tls is None else "tls://",
-            )
         try:
-            self._client = Client(scheduler or self._cluster, security=security, set_as_default=False, timeout="10s")
-        except (OSError, TimeoutError, ValueError) as error:
-            raise ConfigError(f"engine.scheduler: nothing answers at {scheduler}") from error
-
+            with uninterrupted():
+                if scheduler is None:
+                    self._cluster = _local_cluster(workers, worker_memory_mb, security)
+                self._client = _client(scheduler or self._cluster, security)
+        except BaseException:
+            self.__exit__(None, None, None)
+            raise
         self._threads = self._count_threads()
 
     def __enter__(self) -> "DaskEngine":
@@ -84,10 +78,12 @@ class DaskEngine:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._client.close()
-        if self._cluster is not None:
-            self._cluster.close()
-        self._settings.__exit__(None, None, None)
+        with uninterrupted():
+            if hasattr(self, "_client"):
+                self._client.close()
+            if self._cluster is not None:
+                self._cluster.close()
+            self._settings.__exit__(None, None, None)
 
     @property
     def dashboard(self) -> str:
@@ -143,6 +139,29 @@ class DaskEngine:
         except (CancelledError, OSError) as error:
             raise _lost() from error
         return self._tasks.pop(future), result
+
+
+def _local_cluster(workers: int, worker_memory_mb: int, security: Security | None) -> LocalCluster:
+    resource_tracker.ensure_running()  # at its start it would make Ctrl-C visible again
+    with hidden_from_children():
+        return LocalCluster(
+            n_workers=workers,
+            threads_per_worker=1,
+            memory_limit=worker_memory_mb * 2**20 * 2,
+            # Whoever reaches the scheduler or a worker can run any program: nobody from another machine can.
+            host="127.0.0.1",
+            dashboard_address="127.0.0.1:0",
+            silence_logs=50,
+            security=security,
+            protocol=None if security is None else "tls://",
+        )
+
+
+def _client(scheduler: str | LocalCluster, security: Security | None) -> Client:
+    try:
+        return Client(scheduler, security=security, set_as_default=False, timeout="10s")
+    except (OSError, TimeoutError, ValueError) as error:
+        raise ConfigError(f"engine.scheduler: nothing answers at {scheduler}") from error
 
 
 def _security(tls: TlsFiles) -> Security:

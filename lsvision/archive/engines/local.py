@@ -9,12 +9,15 @@ import threading
 from collections import deque
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import suppress
+from multiprocessing import forkserver, resource_tracker
 from types import TracebackType
 from typing import Literal
 
 from lsvision.archive.engines.protocol import MAX_FAILED_STARTS, MAX_WORKER_CRASHES, WORKERS_CRASHED, Finished
 from lsvision.archive.tasks import Outcome, Task, run_in_worker
 from lsvision.errors import LsvisionError
+from lsvision.interruption import hidden_from_children, uninterrupted
 
 StartMethod = Literal["forkserver", "spawn"]
 
@@ -46,8 +49,15 @@ class LocalEngine:
         # The task that every other worker is at; None while it starts.
         self._busy: dict[Future, tuple[Task | None, ProcessPoolExecutor]] = {}
         self._failed_starts = 0
-        for _ in range(workers):
-            self._start_worker()
+        resource_tracker.ensure_running()  # at its start it would make Ctrl-C visible again
+        try:
+            if start_method == "forkserver":
+                self._wait_for_server()
+            for _ in range(workers):
+                self._start_worker()
+        except BaseException:
+            self.__exit__(*sys.exc_info())
+            raise
 
     def __enter__(self) -> "LocalEngine":
         return self
@@ -55,11 +65,12 @@ class LocalEngine:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        for pool in [*self._idle, *(pool for _, pool in self._busy.values())]:
-            # What is in progress is not waited for where the run is ended: a piece that is lost does no harm.
-            for process in list((pool._processes or {}).values()) if kind is not None else ():
-                process.terminate()
-            pool.shutdown(cancel_futures=True)
+        with uninterrupted():
+            for pool in [*self._idle, *(pool for _, pool in self._busy.values())]:
+                # What is in progress is not waited for where the run is ended: a piece that is lost does no harm.
+                for process in list((pool._processes or {}).values()) if kind is not None else ():
+                    process.terminate()
+                pool.shutdown(cancel_futures=True)
 
     @property
     def capacity(self) -> int:
@@ -132,11 +143,24 @@ class LocalEngine:
         while True:
             pool = ProcessPoolExecutor(1, mp_context=self._context, initializer=_enter_worker)
             try:
-                self._busy[pool.submit(os.getpid)] = None, pool
+                with uninterrupted(), hidden_from_children():
+                    self._busy[pool.submit(os.getpid)] = None, pool
                 return
             except (OSError, EOFError, BrokenProcessPool):  # the server that workers are forked from was killed
                 pool.shutdown(wait=False)
                 self._count_failed_start()
+
+    def _wait_for_server(self) -> None:
+        """Wait until the server that workers are forked from has imported what they need, which may be interrupted.
+
+        A worker whose start is interrupted would print a trace for want of its queues: one without any is forked first.
+        """
+        with hidden_from_children():
+            forkserver.ensure_running()  # all that it forks inherit that
+        with suppress(OSError, EOFError):  # it was killed: noticed where workers start
+            first = multiprocessing.get_context("forkserver").Process(target=os.getpid)
+            first.start()
+            first.join()
 
 
 def _forget_stdin() -> None:
@@ -149,8 +173,16 @@ def _forget_stdin() -> None:
 def _enter_worker() -> None:
     """Workers end with the run, however that ends, and leave Ctrl-C to it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    sys.unraisablehook = _end_where_ignored
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))  # ends a task, and then the worker, which tidies up
     threading.Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _end_where_ignored(raised: "sys.UnraisableHookArgs") -> None:
+    """Where ``SystemExit`` cannot be raised, as in ``__del__``, end at once."""
+    if issubclass(raised.exc_type, SystemExit):
+        os._exit(1)
+    sys.__unraisablehook__(raised)
 
 
 def _end_with_parent() -> None:

@@ -1,13 +1,14 @@
 """Checkerboards in images: the grid on a reduced copy, its order from the colours, its corners at full size."""
 
 import dataclasses
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -16,21 +17,27 @@ from lsvision.image.board.order import order_grids, square_contrast
 from lsvision.image.board.placement import LatticeView, place_board
 from lsvision.image.board.refine import DetectedCorners, refine_grid
 from lsvision.image.brightness import gray, gray_bytes
-from lsvision.types import Board, LineImage, TensorImage
+from lsvision.image.missing import missing_mask, missing_near
+from lsvision.types import Board, LineImage, TensorImage, missing_ranges
 
 _REDUCED_WIDTH = 900  # columns in which the coarse search runs: squares of a full-field board still have 40 px
 _REDUCED_RADIUS = 6  # of windows of the reduced copy, px
 _RIM_PX = 8  # of the reduced copy: nearer to its rim a saddle may be missed
+_FEWEST_OF_OPENCV = 3  # corners along a side of the boards that it looks for
 _REDUCE_LINES = 64  # as many as stay in the processor's cache
 
 
 @dataclass(frozen=True)
 class SeenBoard:
-    """A board on the reduced copy of an image: its lattice, before it is known which corner is which."""
+    """A board on the reduced copy of an image: its lattice, before it is known which corner is which.
+
+    ``hidden`` are the lines of the copy that are missing or cut off by missing ones, None where none are missing.
+    """
 
     lattice: SeenLattice
     brightness: Float[Tensor, "lines width"]
     factor: int
+    hidden: Bool[Tensor, " lines"] | None = None
 
     def in_image(self) -> SeenLattice:
         """The lattice in px of the whole image, good to some tenths of a pixel of the copy."""
@@ -50,7 +57,8 @@ class SeenBoard:
 
     def view(self) -> LatticeView:
         """For the search of the board's place on the lattice."""
-        return LatticeView(self.lattice, (self.brightness.shape[0], self.brightness.shape[1]), _RIM_PX)
+        lines, width = self.brightness.shape
+        return LatticeView(self.lattice, (lines, width), _RIM_PX, self.hidden)
 
 
 def detect_board(image: LineImage, board: Board, *, mirrored: bool = False) -> DetectedCorners | None:
@@ -73,7 +81,38 @@ def look_for_board(image: LineImage, board: Board) -> SeenBoard | None:
     factor = max(1, round(image.shape[1] / _REDUCED_WIDTH))
     reduced = reduce_image(image, factor)
     lattice = find_lattice(reduced, board.inner)
-    return SeenBoard(lattice, reduced, factor) if lattice is not None else None
+    if not missing_ranges(image):
+        return SeenBoard(lattice, reduced, factor) if lattice is not None else None
+    missing = _missing_lines(image, factor)
+    if lattice is not None and bool(missing[_extent(lattice)].any()):
+        # A row of corners may be among them: they are counted on one side alone.
+        lattice = find_saddle_lattice(reduced, math.prod(board.inner), missing_near(missing, _RIM_PX))
+    if lattice is None:
+        return None
+    return SeenBoard(lattice, reduced, factor, _cut_off(missing, _extent(lattice)))
+
+
+def _missing_lines(image: LineImage, factor: int) -> Bool[Tensor, " lines"]:
+    """Lines of the reduced copy that are not there."""
+    lines = image.shape[0] // factor * factor
+    return missing_mask(image, torch.arange(lines)).reshape(-1, factor).any(-1)
+
+
+def _extent(lattice: SeenLattice) -> slice:
+    """The lines from the first corner of a lattice to the last."""
+    first, last = torch.aminmax(lattice.position[:, 1])
+    return slice(max(int(first), 0), int(last) + 1)
+
+
+def _cut_off(missing: Bool[Tensor, " lines"], seen: slice) -> Bool[Tensor, " lines"]:
+    """Missing lines and whatever lies beyond them from those that are seen: corners there were not looked for."""
+    beyond = missing.clone()
+    before, after = missing[: seen.start].nonzero(), missing[seen.stop :].nonzero()
+    if len(before):
+        beyond[: int(before[-1])] = True
+    if len(after):
+        beyond[seen.stop + int(after[0]) :] = True
+    return beyond
 
 
 def locate_corners(
@@ -125,6 +164,12 @@ def find_lattice(brightness: Float[Tensor, "lines width"], inner: tuple[int, int
     """Corners of a board, all or those that are seen, as nodes of a lattice; None where no board is seen."""
     if min(brightness.shape) < 2 * max(inner):
         return None
+    # OpenCV's need every corner, and miss boards at some angles and shears.
+    found = _found_by_opencv(brightness, inner) if min(inner) >= _FEWEST_OF_OPENCV else None
+    return found if found is not None else find_saddle_lattice(brightness, inner[0] * inner[1])
+
+
+def _found_by_opencv(brightness: Float[Tensor, "lines width"], inner: tuple[int, int]) -> SeenLattice | None:
     picture = stretch_to_bytes(brightness).numpy()
     found, corners = cv2.findChessboardCornersSB(
         picture, inner, flags=cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE
@@ -133,10 +178,7 @@ def find_lattice(brightness: Float[Tensor, "lines width"], inner: tuple[int, int
         found, corners = cv2.findChessboardCorners(
             picture, inner, flags=cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
         )
-    # Both need every corner, and miss boards at some angles and shears.
-    if found:
-        return SeenLattice.of_grid(_as_grid(corners, inner))
-    return find_saddle_lattice(brightness, inner[0] * inner[1])
+    return SeenLattice.of_grid(_as_grid(corners, inner)) if found else None
 
 
 def stretch_to_bytes(brightness: Float[Tensor, "lines width"]) -> UInt8[Tensor, "lines width"]:

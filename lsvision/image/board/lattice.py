@@ -94,7 +94,9 @@ class SeenLattice:
         return QuadraticMap.fitted(self.node.double(), self.position, 6 if len(self.node) >= _CURVED else 3)
 
 
-def find_saddle_lattice(brightness: Float[Tensor, "lines width"], corners: int) -> SeenLattice | None:
+def find_saddle_lattice(
+    brightness: Float[Tensor, "lines width"], corners: int, hidden: Bool[Tensor, " lines"] | None = None
+) -> SeenLattice | None:
     """The largest lattice of chequered squares in an image; None where there is none.
 
     Saddles are linked to a lattice: neighbours along the squares' edges have opposite curvatures, which no texture has.
@@ -103,8 +105,11 @@ def find_saddle_lattice(brightness: Float[Tensor, "lines width"], corners: int) 
     Args:
         brightness: of an image in which squares have eight pixels or more.
         corners: of the whole board.
+        hidden: lines on which no saddle counts; the lattice ends where they hide a row of its corners.
     """
     saddles = find_saddle_points(brightness, _CANDIDATES * corners, int(_EXPECTED_SHARE * corners))
+    if hidden is not None:
+        saddles = saddles.of(~hidden[saddles.points[:, 1].long()])
     seeds = range(min(_SEEDS, len(saddles.points)))
     lattices = [lattice for seed in seeds if (lattice := grow_lattice(saddles, seed)) is not None]
     if not lattices:

@@ -5,10 +5,11 @@ from dataclasses import dataclass
 
 import torch
 import torch.nn.functional as F  # noqa: N812
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from lsvision.image.board.lattice import SeenLattice
+from lsvision.image.missing import missing_near
 
 _SEEN_SHARE = 0.4  # of the board's corners
 _STRAY_SHARE = 0.1  # of the lattice's corners that may lie beyond the board
@@ -16,11 +17,24 @@ _STRAY_SHARE = 0.1  # of the lattice's corners that may lie beyond the board
 
 @dataclass(frozen=True)
 class LatticeView:
-    """A lattice in one image, the ``(lines, width)`` of that image, and how near its rim corners are found, px."""
+    """A lattice in one image, the ``(lines, width)`` of that image, and how near its rim corners are found, px.
+
+    On ``hidden`` lines there is nothing to be seen, as beyond the rim; None where there are no such lines.
+    """
 
     lattice: SeenLattice
     shape: tuple[int, int]
     rim_px: int
+    hidden: Bool[Tensor, " lines"] | None = None
+
+    def shows(self, position: Float[Tensor, "rows columns 2"]) -> Bool[Tensor, "rows columns"]:
+        """Whether a corner at (u, v) px would have been found."""
+        far = position.new_tensor(self.shape[::-1]) - 1 - self.rim_px
+        inside = ((position >= self.rim_px) & (position <= far)).all(-1)
+        if self.hidden is not None:
+            near = missing_near(self.hidden, self.rim_px)
+            inside &= ~near[position[..., 1].round().long().clamp(0, len(near) - 1)]
+        return inside
 
 
 @dataclass(frozen=True)
@@ -89,9 +103,7 @@ def _seen_and_missing(view: LatticeView, first: Tensor, last: Tensor) -> Float[T
     place = view.lattice.node - first
     seen[place[:, 1], place[:, 0]] = 1
     position = view.lattice.to_image()(node.double())
-    far = position.new_tensor(view.shape[::-1]) - 1 - view.rim_px
-    inside = ((position >= view.rim_px) & (position <= far)).all(-1)
-    return torch.stack([seen, inside * (1 - seen)])
+    return torch.stack([seen, view.shows(position) * (1 - seen)])
 
 
 def _continued(lattice: SeenLattice, size: tuple[int, int]) -> Tensor:

@@ -10,7 +10,8 @@ from lsvision.image.board.correlated_noise import BoardNoise, possible_covarianc
 from lsvision.image.board.outliers import evenly_clipped, in_line_with_neighbours, like_the_board
 from lsvision.image.board.saddle import SaddleOptions, fit_saddles
 from lsvision.image.brightness import gray
-from lsvision.types import LineImage
+from lsvision.image.missing import missing_mask, missing_near
+from lsvision.types import LineImage, missing_ranges
 
 _READ_LINES = 512
 _MODEL_PX = 0.001  # the error that a sharp image without noise or texture leaves: a turned pixel is no box
@@ -108,9 +109,13 @@ def refine_grid(
 
 
 def lies_within(image: LineImage, centre: Int[Tensor, "corners 2"], radius: int) -> Bool[Tensor, " corners"]:
-    """Whether the square windows around (column, line) lie within an image."""
+    """Whether the square windows around (column, line) lie within an image, and none of their lines is missing."""
     lines, width, _ = image.shape
-    return ((centre >= radius) & (centre < torch.tensor([width, lines]) - radius)).all(-1)
+    inside = ((centre >= radius) & (centre < torch.tensor([width, lines]) - radius)).all(-1)
+    if missing_ranges(image):
+        spoiled = missing_near(missing_mask(image, torch.arange(lines)), radius)
+        inside &= ~spoiled[centre[:, 1].clamp(0, lines - 1)]
+    return inside
 
 
 def read_windows(

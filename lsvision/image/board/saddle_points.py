@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import torch
 import torch.nn.functional as F  # noqa: N812
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 _BLUR_PX = 1.5
@@ -23,6 +23,10 @@ class SaddlePoints:
     points: Float[Tensor, "saddles 2"]
     curvature: Float[Tensor, "saddles 3"]
     evenness: Float[Tensor, " saddles"]
+
+    def of(self, chosen: Bool[Tensor, " saddles"]) -> "SaddlePoints":
+        """Some of the points."""
+        return SaddlePoints(self.points[chosen], self.curvature[chosen], self.evenness[chosen])
 
     def alignment(self, index: int) -> Float[Tensor, " saddles"]:
         """How alike in orientation all are to one: 1 is the same, -1 has bright and dark swapped."""

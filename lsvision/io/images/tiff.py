@@ -100,16 +100,19 @@ class TiffBands:
             self._raw_dtype = self.dtype.newbyteorder(page.parent.byteorder)
             self._offsets, self._counts = self._offsets[:1], (page.nbytes,)
             band_lines = STRIP_LINES
+        else:
+            self._check_count(-(-page.imagelength // band_lines) * self._across)
         self.edges = even_edges(page.imagelength, band_lines)
         self._decode = page.decode
         self._tables = {"jpegtables": page.jpegtables, "jpegheader": page.jpegheader}
 
-    def _check_segments(self) -> None:
-        expected = 1 if self._raw_dtype is not None else (len(self.edges) - 1) * self._across
+    def _check_count(self, expected: int) -> None:
         if len(self._offsets) != expected or len(self._counts) != expected:
             raise FileFormatError(
                 self.path, f"not a readable TIFF: expected {expected} strips or tiles, got {len(self._offsets)}"
             )
+
+    def _check_segments(self) -> None:
         if min(self._counts) == 0 or min(self._offsets) == 0:
             raise FileFormatError(self.path, "a strip or tile was never written")
         last_byte = max(offset + count for offset, count in zip(self._offsets, self._counts, strict=True))

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from lsvision.errors import FileFormatError
 from lsvision.io.images.bands import even_edges
-from lsvision.io.images.chunk_size import check_chunks
+from lsvision.io.images.chunk_size import check_chunk_count, check_chunks
 from lsvision.types import MissingLines
 
 _METADATA_FILES = ("zarr.json", ".zarray", ".zgroup")
@@ -39,6 +39,7 @@ class ZarrBands:
         shape = self._array.shape
         if len(shape) not in (2, 3):
             raise FileFormatError(path, f"expected an array (lines, width, channels), got shape {shape}")
+        check_chunk_count(path, self._array)
         self.layout = (shape[0], shape[1], shape[2] if len(shape) == 3 else 1)
         self.dtype = np.dtype(self._array.dtype).newbyteorder("=")
         missing = self._array.nchunks - self._array.nchunks_initialized if self.dtype.kind != "f" else 0

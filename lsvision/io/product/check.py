@@ -8,7 +8,7 @@ import torch
 import zarr
 
 from lsvision.errors import FileFormatError, LsvisionError
-from lsvision.io.images.chunk_size import check_chunks
+from lsvision.io.images.chunk_size import check_chunk_count, check_chunks
 from lsvision.io.product.layout import image_names
 from lsvision.io.product.measured import MeasuredCells
 from lsvision.io.product.pyramid import level_shape, multiscales
@@ -71,6 +71,7 @@ def _check_level(product: Product, key: str, array: Any, shape: tuple[int, int])
     """Shape and checksums of one level; a chunk whose checksum fails cannot be read."""
     if array.shape[-2:] != shape:
         raise FileFormatError(product.path, f"expected {shape[0]} x {shape[1]} cells, got {array.shape}", key)
+    check_chunk_count(product.path / key, array)
     if array.nchunks_initialized != array.nchunks:
         missing = array.nchunks - array.nchunks_initialized
         raise FileFormatError(product.path, f"{missing} of {array.nchunks} chunks are missing", key)

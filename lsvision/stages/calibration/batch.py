@@ -1,12 +1,12 @@
 """The result of calibrating a batch of problems."""
 
 from dataclasses import dataclass
-from typing import Literal
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from lsvision.stages.calibration.along_scan import COMPONENTS
 from lsvision.types import ErrorAlongScan, Iteration
 
 # Errors along the scan below this part of the largest are not mentioned, though allowed for.
@@ -18,9 +18,10 @@ class BatchCalibration:
     """Calibrations of a batch of problems; a problem whose ``info`` is SINGULAR holds NaN.
 
     ``noise_scale`` is the factor on the given covariance that the residuals asked for, 1 where they are as expected;
-    ``along_scan_rms_mm`` and ``along_scan_length_mm`` are of the errors of x, travel and z that are correlated along
-    the scan, zero where none were found; covariances include both. ``rmse_path_mm`` and ``n_path`` run by iteration
-    from the state before (index 0), and repeat the result past a problem's last iteration.
+    ``along_scan_rms_mm`` and ``along_scan_length_mm`` are of the errors in x, travel, z and roll that are correlated
+    along the scan, zero where none were found. Covariances include both, but need not cover errors that are
+    ``along_scan_unlike`` those that were modelled. ``rmse_path_mm`` and ``n_path`` run by iteration from the state
+    before (index 0), and repeat the result past a problem's last iteration.
     """
 
     n: Float[Tensor, "*batch 3"]
@@ -32,8 +33,9 @@ class BatchCalibration:
     board_rmse_before_mm: Float[Tensor, "*batch boards"]
     board_rmse_after_mm: Float[Tensor, "*batch boards"]
     noise_scale: Float[Tensor, "*batch"]
-    along_scan_rms_mm: Float[Tensor, "*batch 3"]
-    along_scan_length_mm: Float[Tensor, "*batch 3"]
+    along_scan_rms_mm: Float[Tensor, "*batch 4"]
+    along_scan_length_mm: Float[Tensor, "*batch 4"]
+    along_scan_unlike: Bool[Tensor, "*batch"]
     iterations: Int[Tensor, "*batch"]
     converged: Bool[Tensor, "*batch"]
     info: Int[Tensor, "*batch"]
@@ -53,7 +55,6 @@ def iterations_of(batch: BatchCalibration) -> tuple[Iteration, ...]:
 def errors_along_scan_of(batch: BatchCalibration) -> tuple[ErrorAlongScan, ...]:
     """Those of one problem that are not much smaller than the largest."""
     rms, length = batch.along_scan_rms_mm.tolist(), batch.along_scan_length_mm.tolist()
-    components: tuple[Literal["x", "travel", "z"], ...] = ("x", "travel", "z")
     return tuple(
-        ErrorAlongScan(*error) for error in zip(components, rms, length, strict=True) if error[1] > _FAINT * max(rms)
+        ErrorAlongScan(*error) for error in zip(COMPONENTS, rms, length, strict=True) if error[1] > _FAINT * max(rms)
     )

@@ -11,9 +11,9 @@ from torch import Tensor
 from lsvision.errors import CalibrationError, ConfigError
 from lsvision.estimation import Info, Posterior
 from lsvision.geometry import sharp_depth_mm
+from lsvision.stages.calibration.along_scan import ErrorsAlongScan
 from lsvision.stages.calibration.batch import BatchCalibration, errors_along_scan_of, iterations_of
 from lsvision.stages.calibration.config import CalibrationConfig
-from lsvision.stages.calibration.correlated import ErrorsAlongScan
 from lsvision.stages.calibration.exchanged import images_exchanged
 from lsvision.stages.calibration.findings import find_flaws
 from lsvision.stages.calibration.hypotheses import Assumed
@@ -26,7 +26,7 @@ from lsvision.stages.calibration.outliers import outlying
 from lsvision.stages.calibration.problem import BoardProblem, MountingPitch
 from lsvision.stages.calibration.scatter import widened
 from lsvision.stages.calibration.solution import estimate_with_noise
-from lsvision.stages.calibration.verdict import judge, not_settled, rmse_grew
+from lsvision.stages.calibration.verdict import UNLIKE, judge, not_settled, rmse_grew
 from lsvision.types import BoardCorners, BoardFit, Calibration, Motion, Pose, Rig
 
 __all__ = ["BatchCalibration", "CalibrationConfig", "calibrate", "calibrate_batch"]
@@ -53,8 +53,9 @@ def calibrate(boards: Sequence[BoardCorners], rig: Rig, config: CalibrationConfi
                 raise CalibrationError(f"{board.scan}: {flaw.value}")
     solution = _solve(measured, config)
     assumed = Assumed(config.prior_sigma, config.board_scale_sigma)
-    findings = find_flaws(boards, solution.problem, solution.start, solution.outlying, assumed)
-    if findings.contradictions and bool(solution.along_scan.found):  # they are no errors along the scan
+    shaken = bool(solution.along_scan.found)
+    findings = find_flaws(boards, solution.problem, solution.start, solution.outlying, assumed, shaken)
+    if findings.contradictions and shaken:  # they are no errors along the scan
         solution = _solve(measured, replace(config, correlated_odds=math.inf))
     batch, scale = solution.summary(), float(solution.noise_scale)
     if int(batch.info) == Info.SINGULAR:
@@ -68,6 +69,8 @@ def calibrate(boards: Sequence[BoardCorners], rig: Rig, config: CalibrationConfi
     before_mm, after_mm = iterations[0].rmse_mm, iterations[-1].rmse_mm
     along_scan = errors_along_scan_of(batch)
     contradictions = [*findings.contradictions, *rmse_grew(before_mm, after_mm)]
+    if bool(batch.along_scan_unlike) and not contradictions:
+        contradictions.append(UNLIKE)
     if scale > 1 or along_scan:  # where the residuals are no noise as stated
         contradictions = images_exchanged(boards, rig, config, after_mm) or contradictions
     judged = judge(not_settled(converged, int(batch.iterations)), contradictions, observability)
@@ -126,7 +129,7 @@ class _Solution:
     noise_scale: Float[Tensor, "*batch"]
     scatter: Float[Tensor, "*batch"]
     along_scan: ErrorsAlongScan
-    prior_sigma: float
+    config: CalibrationConfig
 
     @property
     def weighed(self) -> BoardProblem:
@@ -144,7 +147,7 @@ class _Solution:
         motion_factor = torch.where(singular[..., None, None], torch.nan, posterior.factor[..., -3:, :])
         covariance = motion_factor @ motion_factor.mT
         if bool((self.scatter > 1).any()):
-            covariance = widened(covariance, self.scatter, self.prior_sigma)
+            covariance = widened(covariance, self.scatter, self.config.prior_sigma)
         return BatchCalibration(
             n=state[..., -3:],
             covariance=covariance,
@@ -157,15 +160,19 @@ class _Solution:
             noise_scale=torch.where(singular, torch.nan, self.noise_scale),
             along_scan_rms_mm=self.along_scan.rms_mm,
             along_scan_length_mm=self.along_scan.length_mm,
+            along_scan_unlike=self.along_scan.unlike,
             iterations=posterior.iterations,
             converged=posterior.converged & ~singular,
             info=posterior.info,
         )
 
     def _squared_residuals(self, path: Tensor) -> Tensor:
-        """Sums by iteration and board, mm²; errors along the scan are no fault of n, and poses take what they can."""
+        """Sums by iteration and board, mm²; errors along the scan are no fault of n, and poses take what they can.
+
+        The two-step scheme gives all corners one weight: its poses have taken it.
+        """
         squared, found = squared_residuals(self.problem, path), self.along_scan.found
-        if bool(found.any()):
+        if bool(found.any()) and self.config.method != "two_step":
             shaken = self.problem.at(found)
             squared[:, found] = squared_residuals(shaken, refitted(shaken, path[:, found]))
         return squared
@@ -190,7 +197,7 @@ def _solve(measured: BoardMeasurements, config: CalibrationConfig) -> _Solution:
         found.noise_scale,
         found.scatter,
         found.along_scan,
-        config.prior_sigma,
+        config,
     )
 
 

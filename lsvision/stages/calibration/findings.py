@@ -2,13 +2,15 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from lsvision.stages.calibration.causes import NONE, Candidate, Wander, candidates, wanders
-from lsvision.stages.calibration.departure_fit import Beliefs, fit
+from lsvision.estimation import chi_square_tail
+from lsvision.stages.calibration.along_scan import COMPONENTS
+from lsvision.stages.calibration.causes import NONE, Candidate, candidates
+from lsvision.stages.calibration.departure_fit import fit
 from lsvision.stages.calibration.departures import KINDS, ReducedCorners, placement
 from lsvision.stages.calibration.hypotheses import Assumed, Explanation, explain
 from lsvision.stages.calibration.misplaced import doubts, left_out
@@ -31,40 +33,46 @@ class Findings:
 
 
 def find_flaws(
-    boards: Sequence[BoardCorners], problem: BoardProblem, start: Tensor, outlying: Tensor, assumed: Assumed
+    boards: Sequence[BoardCorners],
+    problem: BoardProblem,
+    start: Tensor,
+    outlying: Tensor,
+    assumed: Assumed,
+    shaken: bool,
 ) -> Findings:
     """What the corners of one problem say of themselves.
 
     Args:
         problem: of batch shape (), without outlying corners. start: its state.
         outlying: ``(boards, corners)``, the corners left out.
+        shaken: whether errors along the scan were found.
     """
-    between = contradictions_between(problem, start, [board.scan for board in boards], assumed)
+    between = contradictions_between(problem, start, [board.scan for board in boards], assumed, shaken)
     off = [left_out(board, outlying[i, : len(board.valid)]) for i, board in enumerate(boards)]
     return Findings((*doubts(off, True), *between.contradictions), doubts(off, False), between.shake)
 
 
-def contradictions_between(problem: BoardProblem, start: Tensor, scans: Sequence[str], assumed: Assumed) -> Findings:
+def contradictions_between(
+    problem: BoardProblem, start: Tensor, scans: Sequence[str], assumed: Assumed, shaken: bool
+) -> Findings:
     """Whether the boards of one problem fit one motion and the stated board, and what explains it where they do not.
 
     Of planar boards alone; others are taken to fit.
     """
     if bool(problem.body_points[..., 2].any()):
         return Findings()
-    reduced = _batch_of_one(ReducedCorners.of(problem)).scaled()
-    at = placement(problem, start).expanded((1,))
-    plain = fit(reduced, at, assumed.hypothesis(at), Beliefs(assumed.motion_sigma))
+    only = problem.at((None,))  # a batch of one
+    reduced, at = ReducedCorners.of(only).scaled(), placement(problem, start).expanded((1,))
+    plain = fit(reduced, at, assumed.hypothesis(at), assumed.motion_sigma)
     freedom = float(problem.boards * (reduced.smooth_freedom - 6) - 3)
-    if _probability(float(plain.chi_square), freedom) > _LOOKED_INTO:
+    if not shaken and float(chi_square_tail(plain.chi_square, freedom)) > _LOOKED_INTO:
         return Findings()
-    explanation = explain(reduced, at, assumed)
+    explanation = explain(only, reduced, at, assumed)
     words = _Words(scans, candidates(problem.boards, reduced.curved, at.n), explanation, _square_mm(problem))
     causes = words.causes()
-    left = float(explanation.chi_square)
-    shake = words.wander(wanders(reduced.curved))
-    if not shake and _probability(left, freedom) < _CONTRADICTION:
-        causes = (*causes, _unexplained(left, freedom, bool(causes)))
-    return Findings(causes, shake=shake)
+    if float(chi_square_tail(explanation.chi_square, freedom)) < _CONTRADICTION:
+        causes = (*causes, _unexplained(float(explanation.chi_square), freedom, bool(causes)))
+    return Findings(causes, shake=words.shake())
 
 
 @dataclass(frozen=True)
@@ -81,14 +89,14 @@ class _Words:
         numbers = [number for number in self.explanation.causes[:, 0].tolist() if number != NONE]
         return tuple(self._cause(self.candidates[number], first=i == 0) for i, number in enumerate(numbers))
 
-    def wander(self, choices: Sequence[Wander]) -> tuple[str, ...]:
+    def shake(self) -> tuple[str, ...]:
         """The sentence on what all corners of a line share."""
-        number = int(self.explanation.wander[0])
-        if number == NONE:
+        (errors,) = self.explanation.along_scan
+        if errors is None:
             return ()
-        wander = choices[number]
-        size = f"about {wander.amplitude_mm:g} mm"
-        if wander.kind == "encoder":
+        rms = errors.rms_mm
+        size = f"about {float(rms.max()):.1g} mm"
+        if COMPONENTS[int(rms.argmax())] == "travel":
             return (f"the travel of the lines is wrong by {size}: the encoder does not agree with the board's rows",)
         return (
             f"the corners of each line are displaced together by {size}: the object shakes or does not run straight",
@@ -193,16 +201,7 @@ def _unexplained(chi_square: float, freedom: float, partly: bool) -> str:
     )
 
 
-def _probability(chi_square: float, freedom: float) -> float:
-    half = torch.tensor([freedom / 2, chi_square / 2], dtype=torch.float64)
-    return float(torch.special.gammaincc(half[0], half[1]))
-
-
 def _square_mm(problem: BoardProblem) -> float:
     """The board's stated spacing: the smallest distance of a corner from the first."""
     away = torch.linalg.vector_norm(problem.body_points[0] - problem.body_points[0, :1], dim=-1)
     return float(away[away > 1e-6].min())
-
-
-def _batch_of_one(reduced: ReducedCorners) -> ReducedCorners:
-    return ReducedCorners(*(getattr(reduced, field.name)[None] for field in fields(reduced)))

@@ -1,9 +1,9 @@
 """Which cause explains boards that contradict each other: hypotheses compared by their evidence, no cause among them.
 
 A cause is accepted where the corners are ``_ACCEPTED`` times more probable under it than without it, the noise being as
-large as the corners themselves show. Causes are added one by one while they are. Errors that all corners of a line
-share, a shake of the object or a wrong travel, are one of the causes: a motion that seems to differ between scans must
-explain the corners better than such errors do.
+large as the corners themselves show. Causes are added one by one while they are. Where they leave errors along the scan
+(see ``along_scan``), these are part of the noise from then on, and causes must explain the corners better than such
+errors alone do: a scan that shakes may seem to have another motion.
 """
 
 import math
@@ -14,14 +14,24 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from lsvision.stages.calibration.causes import NONE, STILL_MM, Candidate, Wander, candidates, wanders
-from lsvision.stages.calibration.departure_fit import Beliefs, DepartureFit, Hypothesis, NormalRows, fit
-from lsvision.stages.calibration.departures import KINDS, KNOTS, Placement, ReducedCorners
+from lsvision.estimation.gaussian_process import covariance_root
+from lsvision.stages.calibration.along_scan import (
+    SUSPICION,
+    Beforehand,
+    FoundErrors,
+    Linearised,
+    by_chance,
+    latents,
+    search,
+)
+from lsvision.stages.calibration.causes import NONE, Candidate, candidates
+from lsvision.stages.calibration.departure_fit import DepartureFit, Hypothesis, fit
+from lsvision.stages.calibration.departures import KINDS, Placement, ReducedCorners, corner_rows
+from lsvision.stages.calibration.problem import BoardProblem
 
 _ACCEPTED = 1e4
 _RIVAL = 100.0  # times less probable than the best, a cause is worth mentioning beside it
 _ROUNDS = 3
-_BOARDS_AT_ONCE = 512  # of systems with a wander: some 10 MB
 
 
 @dataclass(frozen=True)
@@ -29,15 +39,15 @@ class Explanation:
     """What explains the contradictions of a batch of problems.
 
     ``causes`` are numbers of ``candidates`` in the order of their acceptance, ``NONE`` past the last; ``rivals`` are
-    candidates that would have served nearly as well as the first; ``wander`` is one of ``wanders`` or ``NONE``.
-    ``gain`` is the log ratio of the evidence to that without a cause. ``departure`` and ``covariance`` are of the
-    boards' departures of each kind; ``chi_square`` is of the smooth part of the corners, in sigmas of their own noise,
-    before and after.
+    candidates that would have served nearly as well as the first; ``along_scan`` are each problem's errors of lines.
+    ``gain`` is the log ratio of the evidence to that without a cause, the noise the same. ``departure`` and
+    ``covariance`` are of the boards' departures of each kind; ``chi_square`` is of the smooth part of the corners, in
+    sigmas of their own noise, before and after.
     """
 
     causes: Int[Tensor, "steps *batch"]
     rivals: Bool[Tensor, "candidates *batch"]
-    wander: Int[Tensor, "*batch"]
+    along_scan: tuple[FoundErrors | None, ...]
     gain: Float[Tensor, "*batch"]
     departure: Float[Tensor, "*batch boards 7"]
     covariance: Float[Tensor, "*batch 7 boards boards"]
@@ -60,84 +70,114 @@ class Assumed:
         return Hypothesis(pattern, at.n.new_full((count,), self.board_scale_sigma))
 
 
-def explain(reduced: ReducedCorners, start: Placement, assumed: Assumed) -> Explanation:
+def explain(problem: BoardProblem, reduced: ReducedCorners, start: Placement, assumed: Assumed) -> Explanation:
     """The causes that make the corners of each problem of a batch probable.
 
     Args:
-        reduced: corners in sigmas of their own noise, see ``ReducedCorners.scaled``; batch of one dimension.
+        problem: with a batch of one dimension, its noise as stated.
+        reduced: its corners in sigmas of their own noise, see ``ReducedCorners.scaled``.
         start: placements near the boards.
     """
-    return _Search.begin(reduced, start, assumed).run()
+    return _Search.begin(problem, reduced, start, assumed).run()
 
 
 @dataclass
 class _Search:
-    """Greedy choice of causes: in each round the move that raises the evidence most, where it does so by enough."""
+    """Greedy choice of causes: in each round the one that raises the evidence most, where it does so by enough."""
 
+    problem: BoardProblem
     reduced: ReducedCorners
     start: Placement
     assumed: Assumed
     candidates: list[Candidate]
-    wanders: list[Wander]
-    information: Tensor
     causes: Tensor
     rivals: Tensor
-    wander: Tensor
+    along_scan: list[FoundErrors | None]
 
     @classmethod
-    def begin(cls, reduced: ReducedCorners, start: Placement, assumed: Assumed) -> "_Search":
+    def begin(cls, problem: BoardProblem, reduced: ReducedCorners, start: Placement, assumed: Assumed) -> "_Search":
         """Nothing accepted yet."""
         count, boards = start.n.shape[0], start.position.shape[-2]
-        choices = wanders(reduced.curved)
-        still = torch.diag(start.n.new_full((3 * KNOTS,), STILL_MM**-2))
-        information = torch.stack([*(choice.information(start.n) for choice in choices), still])
         causes = candidates(boards, reduced.curved, start.n)
         none = torch.full((_ROUNDS, count), NONE, device=start.n.device)
         rivals = torch.zeros(len(causes), count, dtype=torch.bool, device=start.n.device)
-        return cls(reduced, start, assumed, causes, choices, information, none, rivals, none[0].clone())
+        return cls(problem, reduced, start, assumed, causes, none, rivals, [None] * count)
 
     def run(self) -> Explanation:
-        """Rounds until no move is worth it."""
-        threshold = math.log(_ACCEPTED)
-        here = plain = self.fitted(self.hypothesis())
+        """Causes, then errors along the scan, then the causes that are left beside these."""
+        plain = self.fitted(self.assumed.hypothesis(self.start))
         self.start = self.start.at_poses_of(plain.at, plain.converged)  # mostly near what the causes lead to
-        alone = torch.full_like(plain.log_evidence, -torch.inf)
-        chosen_alone = self.wander.clone()
-        for number in range(_ROUNDS):
-            causes = self.with_each_candidate()
-            best, index = causes.max(0)
-            wander_best, wander_index = self.wandering(here)
-            if number == 0:
-                alone, chosen_alone = wander_best, wander_index
-            to_wander = (wander_best > best) & (wander_best > here.log_evidence + threshold)
-            to_cause = ~to_wander & (best > here.log_evidence + threshold)
-            first = to_cause & (self.causes == NONE).all(0)
-            self.rivals |= first & (causes > best - math.log(_RIVAL))
-            self.wander = torch.where(to_wander, wander_index, self.wander)
-            self.causes[number] = torch.where(to_cause, index, self.causes[number])
-            if not bool((to_wander | to_cause).any()):
+        here = self.with_causes(plain)
+        if self.look_along_the_scans(plain, here):
+            plain = self.fitted(self.assumed.hypothesis(self.start))
+            here = self.with_causes(self.fitted(self.hypothesis()))
+        return self.explanation(plain, here)
+
+    def with_causes(self, here: DepartureFit) -> DepartureFit:
+        """The fit with all causes that are worth it added to those of a fit."""
+        threshold, problems = math.log(_ACCEPTED), torch.arange(len(self.along_scan))
+        for _ in range(_ROUNDS):
+            evidence = self.with_each_candidate()
+            best, index = evidence.max(0)
+            free = self.causes == NONE
+            accepted = free.any(0) & (best > here.log_evidence + threshold)
+            if not bool(accepted.any()):
                 break
+            self.rivals |= accepted & free.all(0) & (evidence > best - math.log(_RIVAL))
+            slot = free.to(torch.long).argmax(0)
+            self.causes[slot, problems] = torch.where(accepted, index, self.causes[slot, problems])
             here = self.fitted(self.hypothesis())
-        superfluous = (self.causes != NONE).any(0) & (self.wander != NONE) & (alone > here.log_evidence - threshold)
-        self.wander = torch.where(superfluous, chosen_alone, self.wander)
-        self.causes = torch.where(superfluous, NONE, self.causes)
-        return self.explanation(plain, self.fitted(self.hypothesis()))
+        return here
+
+    def look_along_the_scans(self, plain: DepartureFit, here: DepartureFit) -> bool:
+        """Whether errors along the scan were found, in problems whose residuals are correlated under their causes.
+
+        They are part of the corners' noise then, under which the causes have to be found again. Where they alone
+        explain as much as they do beside the causes, they are taken as they are alone.
+        """
+        without, hypothesis, threshold = self.assumed.hypothesis(self.start), self.hypothesis(), math.log(_ACCEPTED)
+        known, scale = Beforehand(0.0, _ACCEPTED), self.reduced.noise_scale.sqrt()
+        for i in range(len(self.along_scan)):
+            one, given = self.problem.at((i,)), self.linearised(i, here, hypothesis)
+            white = torch.linalg.solve_triangular(one.noise_chol, given.columns[..., -1:], upper=False)[..., 0]
+            if bool(by_chance(one, white / scale[i, :, None, None]) > SUSPICION):
+                continue
+            errors = search(one, given, known)
+            if errors is None:
+                continue
+            if bool((self.causes[:, i] != NONE).any()):
+                alone = search(one, self.linearised(i, plain, without), known)
+                if alone is not None and alone.log_evidence > errors.log_evidence - threshold:
+                    errors = alone
+            self.causes[:, i], self.rivals[:, i] = NONE, False
+            self.along_scan[i] = errors
+            noisy = ReducedCorners.with_latents(one, latents(one, covariance_root(errors.covariance[None])))
+            self.reduced = self.reduced.replaced(i, noisy.scaled())
+        return any(errors is not None for errors in self.along_scan)
+
+    def linearised(self, i: int, fitted: DepartureFit, hypothesis: Hypothesis) -> Linearised:
+        """The corners of one problem about a fit, beside n the parameters of its hypothesis shared by all boards."""
+        rows = corner_rows(self.problem.at((i,)), fitted.at.one(i))
+        pose_and_n, departures, residual = rows.split([9, len(KINDS), 1], dim=-1)
+        columns = torch.cat([pose_and_n, departures @ hypothesis.pattern[i][:, None], residual], dim=-1)
+        n = fitted.at.n[i]
+        away = torch.cat([n - n.new_tensor([0.0, 1.0, 0.0]), fitted.parameters[i]])
+        sigma = torch.cat([n.new_full((3,), self.assumed.motion_sigma), hypothesis.sigma])
+        return Linearised(columns, torch.cat([torch.diag(1 / sigma), (-away / sigma)[:, None]], dim=-1))
 
     def explanation(self, plain: DepartureFit, fitted: DepartureFit) -> Explanation:
         """The result of a search."""
-        hypothesis = self.hypothesis()
-        by_kind = hypothesis.pattern.movedim(-2, -3)  # (*batch, 7, boards, parameters)
+        by_kind = self.hypothesis().pattern.movedim(-2, -3)  # (*batch, 7, boards, parameters)
         covariance = by_kind @ fitted.covariance[..., None, :, :] @ by_kind.mT
-        gain = fitted.log_evidence - plain.log_evidence
         return Explanation(
-            self.causes,
-            self.rivals,
-            self.wander,
-            gain,
-            fitted.at.departure,
-            covariance,
-            plain.chi_square,
-            fitted.chi_square,
+            causes=self.causes,
+            rivals=self.rivals,
+            along_scan=tuple(self.along_scan),
+            gain=fitted.log_evidence - plain.log_evidence,
+            departure=fitted.at.departure,
+            covariance=covariance,
+            chi_square_before=plain.chi_square,
+            chi_square=fitted.chi_square,
         )
 
     def hypothesis(self) -> Hypothesis:
@@ -159,15 +199,9 @@ class _Search:
         pattern = torch.cat([given.pattern, *patterns], dim=-1)
         return Hypothesis(pattern, torch.cat([given.sigma, pattern.new_ones(size * len(used))]))
 
-    def beliefs(self) -> Beliefs:
-        """Priors with the wander accepted so far."""
-        if bool((self.wander == NONE).all()):
-            return Beliefs(self.assumed.motion_sigma)
-        return Beliefs(self.assumed.motion_sigma, self.information[self.wander][:, None])
-
     def fitted(self, hypothesis: Hypothesis) -> DepartureFit:
         """The fit under a hypothesis."""
-        return fit(self.reduced, self.start, hypothesis, self.beliefs())
+        return fit(self.reduced, self.start, hypothesis, self.assumed.motion_sigma)
 
     def with_each_candidate(self) -> Tensor:
         """Log evidence with one more cause, ``(candidates, *batch)``; those of one kind and size are fitted at once."""
@@ -180,16 +214,3 @@ class _Search:
             pattern = torch.cat([accepted.pattern.expand(*shape, -1), more.expand(*shape, -1)], dim=-1)
             found.append(self.fitted(Hypothesis(pattern, torch.cat([accepted.sigma, group[0].sigma]))).log_evidence)
         return torch.cat(found)
-
-    def wandering(self, here: DepartureFit) -> tuple[Tensor, Tensor]:
-        """The evidence with the best wander about a fit, and which it is; scans that wander already keep theirs."""
-        if not self.wanders:
-            return torch.full_like(here.log_evidence, -torch.inf), self.wander
-        rows = NormalRows.of(self.reduced, here.at, self.hypothesis(), here.parameters)
-        at_once = max(1, _BOARDS_AT_ONCE // self.start.position[..., 0].numel())
-        by_wander = [
-            rows.solved(Beliefs(self.assumed.motion_sigma, some[:, None, None])).log_evidence()
-            for some in self.information[:-1].split(at_once)
-        ]
-        best, index = torch.cat(by_wander).max(0)
-        return torch.where(self.wander == NONE, best, -torch.inf), index

@@ -47,7 +47,11 @@ def whitened_residuals(problem: BoardProblem, state: Float[Tensor, "*#batch stat
     Where the corners of a board err together, thirteen of each board, of the same sum of squares.
     """
     theta = BoardState.split(state).theta
-    rows = residuals_in_sigmas(problem, state).flatten(-3) if problem.correlated is None else _by_board(problem, state)
+    rows = (
+        residuals_in_sigmas(problem, state).flatten(-3)
+        if problem.correlated is None
+        else board_rows(problem, state).flatten(-2)
+    )
     if problem.pitch is None:
         return rows
     return torch.cat([rows, (problem.pitch.angle - pitch_angle(problem, theta)) / problem.pitch.sigma], dim=-1)
@@ -103,10 +107,13 @@ def pitch_angle(problem: BoardProblem, theta: Float[Tensor, "*#batch boards 3"])
     return torch.atan2(-normal[..., 1], normal[..., 2])
 
 
-def _by_board(problem: BoardProblem, state: Tensor) -> Tensor:
-    """Through the affine map from board points to measured ones, which ``affine_rows`` are about."""
+def board_rows(problem: BoardProblem, state: Float[Tensor, "*#batch state"]) -> Float[Tensor, "*batch boards 13"]:
+    """Thirteen rows of each board, in sigmas, whose sum of squares is that of its corners' residuals.
+
+    Through the affine map from board points to measured ones, which ``affine_rows`` are about.
+    """
     parts = BoardState.split(state)
     placed = torch.cat([parts.position[..., None, :], problem.rotation_at(parts.theta).mT], dim=-2)
     coefficients = scan_position(placed, parts.n[..., None, None, :]).flatten(-2)
     rows = problem.affine_rows
-    return (rows[..., -1] - apply(rows[..., :-1], coefficients)).flatten(-2)
+    return rows[..., -1] - apply(rows[..., :-1], coefficients)

@@ -1,13 +1,12 @@
 """Whether the corners' residuals are as large as their covariance says: over all boards, and board by board."""
 
-from dataclasses import replace
-
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from lsvision.estimation import chi_square_tail
 from lsvision.stages.calibration.config import CalibrationConfig
-from lsvision.stages.calibration.linearise import linearise, point_factor
+from lsvision.stages.calibration.model import board_rows
 from lsvision.stages.calibration.problem import BoardProblem
 from lsvision.stages.calibration.sequential import filtered
 
@@ -51,7 +50,7 @@ def board_chi_square(problem: BoardProblem, state: Float[Tensor, "*batch state"]
 
 
 def _beyond_chance(squared: Tensor, freedom: Tensor) -> Tensor:
-    unlikely = torch.special.gammaincc(freedom / 2, squared / 2) < _NOISE_TEST_LEVEL
+    unlikely = chi_square_tail(squared, freedom) < _NOISE_TEST_LEVEL
     return torch.where(unlikely, squared / freedom, 1.0)
 
 
@@ -59,6 +58,4 @@ def squared_residuals_of_boards(
     problem: BoardProblem, state: Float[Tensor, "*batch state"]
 ) -> Float[Tensor, "*batch boards"]:
     """Squared residuals in sigmas of the given noise, summed over the corners of each board."""
-    corners_alone = problem if problem.pitch is None else replace(problem, pitch=None)
-    rows = linearise(corners_alone, state, point_factor(state)).matrix[..., -1]
-    return rows.unflatten(-1, (problem.boards, -1)).square().sum(-1)
+    return board_rows(problem, state).square().sum(-1)

@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import pad
 
-from lsvision.estimation import apply
+from lsvision.estimation import apply, chi_square_tail
 from lsvision.stages.calibration.problem import BoardProblem
 
 # Squared distance, in sigmas, beyond which a corner lies off: one of 1e5 sound ones does (chi-square of 3).
@@ -101,7 +101,7 @@ def outlying(problem: BoardProblem) -> Bool[Tensor, "*batch boards corners"]:
     off = torch.zeros_like(problem.valid)
     rows = problem.affine_rows[..., 3 * _PLANAR :, -1]  # of what no affine map of a planar board explains
     freedom = (3 * problem.valid.sum(-1) - 3 * _PLANAR).clamp(min=1)
-    suspicious = torch.special.gammaincc(freedom / 2, rows.square().sum(-1) / 2) < _SUSPICIOUS
+    suspicious = chi_square_tail(rows.square().sum(-1), freedom) < _SUSPICIOUS
     if not bool(suspicious.any()) or bool(problem.body_points[..., 2].any()):
         return off
     boards = _Boards.of(problem, suspicious)

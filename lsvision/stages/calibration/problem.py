@@ -65,7 +65,7 @@ class BoardProblem:
         """Number of boards, B; the state has 6 B + 3 components."""
         return self.points.shape[-3]
 
-    def at(self, place: tuple[int, ...] | Bool[Tensor, "*batch"]) -> "BoardProblem":
+    def at(self, place: tuple[int | None, ...] | Bool[Tensor, "*batch"]) -> "BoardProblem":
         """One problem of a batch by its indices, or those of a mask in a row."""
         names = ("points", "noise_chol", "body_points", "centroid", "valid", "rotation")
         correlated = None if self.correlated is None else self.correlated.at(place)

@@ -19,12 +19,12 @@ _BOARDS_IN_CACHE = 64
 
 @dataclass(frozen=True)
 class CorrelatedNoise:
-    """``affine_rows`` whitened by a noise that is correlated between a board's corners, and its log-determinant."""
+    """``feature_rows`` whitened by a noise that is correlated between a board's corners, and its log-determinant."""
 
-    rows: Float[Tensor, "*batch boards 13 13"]
+    rows: Float[Tensor, "*batch boards rows rows"]
     log_det: Float[Tensor, "*batch"]
 
-    def at(self, place: Bool[Tensor, "*batch"] | tuple[int, ...]) -> "CorrelatedNoise":
+    def at(self, place: Bool[Tensor, "*batch"] | tuple[int | None, ...]) -> "CorrelatedNoise":
         """That of the problems where a mask is true, in a row; of the one at a tuple of indices."""
         return CorrelatedNoise(self.rows[place], self.log_det[place])
 
@@ -43,7 +43,12 @@ def affine_rows(
     Args:
         noise_chol: Cholesky factor of the covariance of ``points``, mm.
     """
-    return feature_rows(noise_chol, points, torch.cat([torch.ones_like(body_points[..., :1]), body_points], -1), valid)
+    return feature_rows(noise_chol, points, affine_features(body_points), valid)
+
+
+def affine_features(body_points: Float[Tensor, "*batch corners 3"]) -> Float[Tensor, "*batch corners 4"]:
+    """The features (1, p) of a corner, in which an affine map is linear."""
+    return torch.cat([torch.ones_like(body_points[..., :1]), body_points], dim=-1)
 
 
 def feature_rows(
@@ -67,19 +72,18 @@ def feature_rows(
 def rows_with_latents(
     noise_chol: Float[Tensor, "boards corners 3 3"],
     points: Float[Tensor, "boards corners 3"],
-    body_points: Float[Tensor, "boards corners 3"],
+    features: Float[Tensor, "boards corners features"],
     valid: Bool[Tensor, "boards corners"],
     latents: Float[Tensor, "boards corners 3 latents"],
 ) -> CorrelatedNoise:
-    """``affine_rows`` of corners that err by ``latents`` @ ξ too, ξ ~ N(0, I) of each board.
+    """``feature_rows`` of corners that err by ``latents`` @ ξ too, ξ ~ N(0, I) of each board.
 
     ξ are unknowns with a unit prior, eliminated by the same QR: no covariance between corners is ever formed. The
     log-determinant is that of the whole noise less that of ``noise_chol``.
     """
     count = latents.shape[-1]
     eye = torch.eye(3, dtype=points.dtype, device=points.device)
-    factors = torch.nn.functional.pad(body_points, (1, 0), value=1.0)
-    by_map = (factors[..., None, :, None] * eye[:, None, :]).flatten(-2)
+    by_map = (features[..., None, :, None] * eye[:, None, :]).flatten(-2)
     columns = torch.cat([latents, by_map, points[..., None]], dim=-1)
     whitened = torch.linalg.solve_triangular(noise_chol, columns, upper=False)
     whitened = torch.where(valid[..., None, None], whitened, 0.0).flatten(-3, -2)

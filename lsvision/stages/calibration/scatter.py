@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from lsvision.estimation import Posterior
+from lsvision.estimation import Posterior, chi_square_tail
 from lsvision.stages.calibration.problem import BoardProblem
 
 # A scatter so large has less than this probability.
@@ -36,7 +36,7 @@ def scatter(
     between = (squared - within / noise_scale).clamp(min=0)
     known_by_prior = posterior.factor[..., -3:, :].square().sum((-2, -1)) / prior_sigma**2
     freedom = (planar - 6.0) * problem.boards - 3.0 + known_by_prior.clamp(max=3.0)
-    unlikely = torch.special.gammaincc(freedom / 2, between / 2) < _LEVEL
+    unlikely = chi_square_tail(between, freedom) < _LEVEL
     return torch.where(unlikely, (between / freedom).clamp(min=1.0), 1.0)
 
 

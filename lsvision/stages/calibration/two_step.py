@@ -17,6 +17,7 @@ from lsvision.stages.calibration.joint import moved_to, posterior_from
 from lsvision.stages.calibration.linearise import linearise, point_factor
 from lsvision.stages.calibration.mode import gauss_newton_step, rows_of
 from lsvision.stages.calibration.model import rmse
+from lsvision.stages.calibration.noise import noise_scale, squared_residuals_of_boards
 from lsvision.stages.calibration.prior import prior_about
 from lsvision.stages.calibration.problem import BoardProblem, BoardState
 from lsvision.stages.calibration.reduction import CorrelatedNoise
@@ -31,11 +32,13 @@ def two_step(problem: BoardProblem, start: Float[Tensor, "*batch state"], config
 
     It has converged where one joint step from its result would gain little. Its covariance is that of the joint
     calibration and the square of the distance to that: of all unknowns together, as that of Step-II, with the poses
-    fixed, would claim directions of n that the boards cannot show; and of what the iteration still lacks.
+    fixed, would claim directions of n that the boards cannot show; and of what the iteration still lacks. Noise that is
+    correlated along the scan counts in the covariance alone: the paper weighs every corner by itself.
 
     Source: Wang et al. 2024, Algorithm 1; its step 8 is printed with the inequality the wrong way round.
     """
-    prior, middles = prior_about(start, config), Middles.of(problem)
+    plain = replace(problem, correlated=None)
+    prior, middles = prior_about(start, config), Middles.of(plain)
     state, path, before = start, [start], rmse(problem, start)
     running = before > config.two_step_threshold_mm
     iterations = torch.zeros_like(running, dtype=torch.long)
@@ -50,7 +53,7 @@ def two_step(problem: BoardProblem, start: Float[Tensor, "*batch state"], config
         iterations, after = iterations + running, rmse(problem, state)
         still = (before - after).abs() <= config.two_step_tolerance * before
         running, before = running & ~still & (after > config.two_step_threshold_mm), after
-    reached = gauss_newton_step(problem, rows_of(prior), state)
+    reached = gauss_newton_step(_as_scattered(plain, state), rows_of(prior), state)
     by_all = posterior_from(problem, prior, state, replace(config, max_iterations=_JOINT_ITERATIONS))
     converged = (reached.distance.square() / 2 <= _SETTLED) & by_all.converged
     factor = moved_to(state, by_all)
@@ -100,6 +103,12 @@ class Middles:
         parts = BoardState.split(state)
         position = parts.position + sign * self.travel[..., None] * parts.n[..., None, :]
         return replace(parts, position=position).join()
+
+
+def _as_scattered(problem: BoardProblem, state: Tensor) -> BoardProblem:
+    """The problem with its noise as large as the residuals: a step is long or short against that."""
+    squared = squared_residuals_of_boards(problem, state)
+    return problem.scaled(noise_scale(problem, squared, torch.zeros_like(squared[..., 0])))
 
 
 def _updated_part(middles: Middles, prior: Prior, state: Tensor, part: slice, config: CalibrationConfig) -> Tensor:

@@ -7,6 +7,11 @@ from lsvision.types import Observability, Verdict
 
 # The calibration weighs corners by their covariance, the RMSE does not: it may rise by a little where n is nominal.
 _RMSE_GROWTH = 1.1
+# The contradiction that errors along the scan are none that the sigma of n allows for.
+UNLIKE = (
+    "the lines are displaced by errors that are no steady vibration and no encoder error that all scans share: "
+    "look for a scan that shook far more than the others, a jolt or a slip"
+)
 
 
 @dataclass(frozen=True)

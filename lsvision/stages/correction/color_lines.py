@@ -5,6 +5,7 @@ s / n2 of travel later and in another column (``ProductFrame.shifted_column``).
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -32,6 +33,8 @@ class ColorLines:
         sampling: how they are interpolated.
         shift_mm: where each colour looks along Y, beyond green. rows: ``(channels, lines)``, float64: the image row in
             which a colour shows what green shows on each line. Both are None where all colours look at one line.
+        registered: rows by which the camera has shifted each colour: row less ``registered`` is the line that it was
+            taken on.
     """
 
     frame: ProductFrame
@@ -40,6 +43,7 @@ class ColorLines:
     sampling: Sampling
     shift_mm: Tensor | None = None
     rows: Tensor | None = None
+    registered: Sequence[float] = ()
 
     def sample(self, image: Tensor, seen: SeenCells, out: Tensor) -> None:
         """Write the colours of cells, ``(rows, columns, channels)``, to ``out``.
@@ -55,9 +59,11 @@ class ColorLines:
         base = seen.line.nan_to_num().floor().clamp(-begin, self.rows.shape[1] - 2 - begin)
         part, base = (seen.line - base).double(), base.long() + begin
         column, relief = seen.column.double(), seen.relief.double()
+        line = seen.line.double() + seen.first_line
         for channel, (shift_mm, rows) in enumerate(zip(self.shift_mm, self.rows - self.image_range[0], strict=True)):
             row, into = torch.lerp(rows[base], rows[base + 1], part), torch.empty_like(out[..., :1])
-            shifted = self.frame.shifted_column(column, relief, shift_mm)
+            taken = row + (self.image_range[0] - self.registered[channel])
+            shifted = self.frame.shifted_column(column, relief, shift_mm, (line, taken))
             sample_image(image[..., [channel]], shifted, row, self.sampling, out=into)
             out[..., [channel]] = into
 
@@ -76,9 +82,10 @@ def color_lines(scan: Scan, frame: ProductFrame, lines: tuple[int, int], samplin
         image_range = max(lines[0] - reach, 0), min(lines[1] + reach, scan.lines)
         return ColorLines(frame, lines[0], image_range, sampling)
     shift_mm, rows = shift * scan.travel.line_pitch_mm, _color_rows(scan, frame, lines, shift)
+    registered = _registered(scan, shift).tolist()
     first, last = math.floor(float(rows.min())) - reach, math.ceil(float(rows.max())) + reach + 1
     image_range = min(max(first, 0), scan.lines - 1), max(min(last, scan.lines), 1)
-    return ColorLines(frame, lines[0], image_range, sampling, shift_mm, rows)
+    return ColorLines(frame, lines[0], image_range, sampling, shift_mm, rows, registered)
 
 
 def lines_without_colors(scan: Scan, frame: ProductFrame, sampling: Sampling) -> Bool[Tensor, " lines"]:
@@ -104,7 +111,13 @@ def _color_rows(
 ) -> Float[Tensor, "channels lines"]:
     """The image row in which each colour shows what green shows on each of some lines."""
     shift_mm = shift * scan.travel.line_pitch_mm
-    rows = frame.shifted_line(torch.arange(*lines, dtype=torch.float64), shift_mm[:, None])
-    if scan.color_registered:  # the camera has shifted each colour by as many rows
-        rows = rows + (-1.0 if scan.travel.transport == "reverse" else 1.0) * shift[:, None]
-    return rows
+    return (
+        frame.shifted_line(torch.arange(*lines, dtype=torch.float64), shift_mm[:, None])
+        + _registered(scan, shift)[:, None]
+    )
+
+
+def _registered(scan: Scan, shift: Float[Tensor, " channels"]) -> Float[Tensor, " channels"]:
+    """Rows by which the camera has shifted each colour: as many as its sensor line looks beyond green, or none."""
+    sign = -1.0 if scan.travel.transport == "reverse" else 1.0
+    return sign * shift if scan.color_registered else torch.zeros_like(shift)

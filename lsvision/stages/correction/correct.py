@@ -20,40 +20,52 @@ from lsvision.stages.correction.grid import plan_product, source_dtype
 from lsvision.stages.correction.locate import Locator, SeenCells, cell_spacing
 from lsvision.stages.correction.profiles import DepthWithoutLines, ProfileReader, ProfileRule
 from lsvision.stages.correction.uncertainty import position_sigma
-from lsvision.types import DepthSource, Motion, ProductGrid, ProductStrip, Scan, missing_ranges
+from lsvision.types import DepthSource, LineMotion, Motion, ProductGrid, ProductStrip, Scan, missing_ranges
 
 # Lines under a tile, of the 8192 over which ``PIXEL_PARTS`` are exact: slope and relief of the object add to them.
 _TILE_LINES = 4096
 
 
 def correct_scan(
-    scan: Scan, depth: DepthSource, motion: Motion, config: CorrectionConfig, grid: ProductGrid | None = None
+    scan: Scan,
+    depth: DepthSource,
+    motion: Motion,
+    config: CorrectionConfig,
+    grid: ProductGrid | None = None,
+    line_motion: LineMotion | None = None,
 ) -> Iterator[ProductStrip]:
     """Rebuild a scan in the product frame, strip by strip, in memory that does not grow with its length.
 
     Args:
         depth: of the left image: ``depth_of(scan, ..)``.
         grid: cells to fill; ``plan_product`` where it is None.
+        line_motion: motion from line to line; None leaves it in the product.
     """
-    correction = Correction(scan, depth, motion, config, grid or plan_product(scan, motion, config))
+    correction = Correction(scan, depth, motion, config, grid or plan_product(scan, motion, config), line_motion)
     for row in range(0, correction.grid.rows, config.strip_rows):
         yield correction.strip((row, min(row + config.strip_rows, correction.grid.rows)))
 
 
 @dataclass(frozen=True)
 class Correction:
-    """A scan on its way to a product; rows come out the same whatever strip they are computed in."""
+    """A scan on its way to a product; rows come out the same whatever strip they are computed in.
+
+    The grid does not depend on the line motion: products with and without it have the same cells. What the motion moves
+    beyond its rim is lost.
+    """
 
     scan: Scan
     depth: DepthSource
     motion: Motion
     config: CorrectionConfig
     grid: ProductGrid
+    line_motion: LineMotion | None = None
 
     @cached_property
     def frame(self) -> ProductFrame:
         """The frame of the product."""
-        return ProductFrame(self.scan.rig, self.scan.travel, self.motion.n)
+        still = self.line_motion is None or self.line_motion.is_still
+        return ProductFrame(self.scan.rig, self.scan.travel, self.motion.n, None if still else self.line_motion)
 
     @cached_property
     def locator(self) -> Locator:
@@ -118,11 +130,10 @@ class Correction:
 
     def _position_sigma(self, seen: SeenCells) -> Tensor:
         column, line = seen.column.double(), seen.line.double() + seen.first_line
-        sigma = seen.depth_sigma
+        sigma, z = seen.depth_sigma, self.frame.depth(column, seen.relief.double(), line)
         if sigma is None:
-            z = self.frame.depth(column, seen.relief.double())
             sigma = depth_sigma(self.scan.rig, z, self.config.disparity_sigma_px)
-        return position_sigma(self.frame, self.motion.covariance, column, line, sigma)
+        return position_sigma(self.frame, self.motion.covariance, column, line, sigma, z)
 
     def _empty_strip(self, rows: tuple[int, int]) -> ProductStrip:
         shape, left = (rows[1] - rows[0], self.grid.columns), self.scan.left

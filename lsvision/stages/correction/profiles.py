@@ -6,10 +6,10 @@ q_x and q_z of a sample depend on its own line alone, so this needs no travel, a
 from dataclasses import dataclass, field
 
 import torch
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 from torch import Tensor
 
-from lsvision.geometry import ProductFrame, zero_disparity_mm
+from lsvision.geometry import ProductFrame, slope_at, zero_disparity_mm
 from lsvision.image.tiling import in_parallel
 from lsvision.image.visibility import Seen, Surface, bridge_gaps, see_cells
 from lsvision.types import Depth, DepthSource
@@ -32,8 +32,11 @@ class ProfileRule:
     bridge_px: int
 
 
-def resolve_profiles(depth: Depth, frame: ProductFrame, rule: ProfileRule) -> Seen:
+def resolve_profiles(depth: Depth, frame: ProductFrame, rule: ProfileRule, first_line: int = 0) -> Seen:
     """What the columns of a product see on some lines.
+
+    Args:
+        first_line: line of the scan that the depth begins with.
 
     Returns:
         ``place`` is the column of the left image, px; ``height`` is the relief z0 - q_z, mm; bridged cells are not
@@ -52,15 +55,53 @@ def resolve_profiles(depth: Depth, frame: ProductFrame, rule: ProfileRule) -> Se
     cells_per_mm, q_z_per_mm = ray[:, 0] / rule.pitch_mm, ray[:, 2]
     cell = middle * cells_per_mm - rule.origin_x_mm / rule.pitch_mm
     relief = zero_disparity_mm(frame.rig) - middle * q_z_per_mm
+    part = torch.addcmul((cell - cell.floor()).to(z.dtype), beyond, cells_per_mm.to(z.dtype))
+    height = torch.addcmul(relief.to(z.dtype), beyond, -q_z_per_mm.to(z.dtype))
+    if frame.line_motion is not None:
+        _displace(part, height, beyond, _LineShift.of(frame, rule, first_line, len(z)), middle)
     surface = Surface(
         whole=cell.floor().to(z.dtype),
-        part=torch.addcmul((cell - cell.floor()).to(z.dtype), beyond, cells_per_mm.to(z.dtype)),
-        height=torch.addcmul(relief.to(z.dtype), beyond, -q_z_per_mm.to(z.dtype)),
+        part=part,
+        height=height,
         carried=() if depth.sigma is None else (depth.sigma,),
         connected=beyond.diff(dim=1).abs_() <= rule.largest_step_mm,  # false beside a hole
         measured=measured[:, 1:] & measured[:, :-1],
     )
     return see_cells(surface, rule.columns, dim=1)
+
+
+@dataclass(frozen=True)
+class _LineShift:
+    """What line motion adds to (cell, relief): z (slope by_slope + by_depth) + offset, for each line, float64."""
+
+    slope: Float[Tensor, " columns"]
+    by_slope: Float[Tensor, "lines 2"]
+    by_depth: Float[Tensor, "lines 2"]
+    offset: Float[Tensor, "lines 2"]
+
+    @classmethod
+    def of(cls, frame: ProductFrame, rule: ProfileRule, first_line: int, lines: int) -> "_LineShift":
+        """That of consecutive lines of a frame."""
+        axes = frame.line_axes(torch.arange(first_line, first_line + lines).double())
+        unit = axes.origin.new_tensor([1 / rule.pitch_mm, -1.0])  # cells, and a relief that falls with q_z
+        across, ahead = (
+            turned[:, ::2] - still
+            for turned, still in zip((axes.across, axes.ahead), (frame.axes[::2, 0], frame.axes[::2, 2]), strict=True)
+        )
+        slope = slope_at(frame.rig, torch.arange(frame.rig.width_px).double())
+        return cls(slope, across * unit, ahead * unit, axes.origin[:, ::2] * unit)
+
+
+def _displace(part: Tensor, height: Tensor, beyond: Tensor, shift: _LineShift, middle: float) -> None:
+    """Add the line motion to cells and reliefs of samples at depths middle + beyond, mm; in place."""
+    slope = shift.slope.to(part.dtype)
+    for index, values in enumerate((part, height)):
+        # What the roll adds at the middle depth is summed in double precision and is small after that.
+        level = (middle * shift.by_depth + shift.offset)[:, index, None].to(part.dtype)
+        tilt, gain = (middle * shift.by_slope)[:, index, None].to(part.dtype), shift.by_depth[:, index, None]
+        values.add_(torch.addcmul(level, tilt, slope))
+        turned = torch.addcmul(gain.to(part.dtype), shift.by_slope[:, index, None].to(part.dtype), slope)
+        values.addcmul_(beyond, turned)
 
 
 @dataclass(frozen=True)
@@ -111,7 +152,10 @@ class ProfileReader:
             """Profiles of one block of lines."""
             lines = slice(index * _BLOCK_LINES - first, (index + 1) * _BLOCK_LINES - first)
             return resolve_profiles(
-                Depth(depth.z[lines], None if sigma is None else sigma[lines]), self.frame, self.rule
+                Depth(depth.z[lines], None if sigma is None else sigma[lines]),
+                self.frame,
+                self.rule,
+                index * _BLOCK_LINES,
             )
 
         self._blocks.update(zip(missing, in_parallel(resolve_block, missing), strict=True))

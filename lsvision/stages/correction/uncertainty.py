@@ -16,22 +16,28 @@ def position_sigma(
     column: Float[Tensor, "*cells"],
     line: Float[Tensor, "*cells"],
     depth_sigma: Float[Tensor, "*cells"],
+    z: Float[Tensor, "*cells"] | None = None,
 ) -> Float[Tensor, "*cells 3"]:
     """Standard deviation, mm, of (q_x, q_y, q_z) of cells, relative to the first line of their scan.
 
     An error of the depth moves a point along its ray; an error of n displaces it in proportion to its travel from the
-    first line; an error of the travel of a repaired line moves it along the motion. What no log shows, as vibration
-    from line to line, is not part of it.
+    first line; an error of the travel of a repaired line moves it along the motion; an error of a line's own motion
+    displaces and turns what it shows. Motion from line to line that was not corrected is not part of it.
 
     Args:
         covariance: of n. column, line: position in the scan that a cell came from, px.
         depth_sigma: of the depth there, mm.
+        z: depth there, mm; needed where the frame has line motion.
     """
-    along_ray = frame.ray(column) * depth_sigma[..., None]
+    along_ray = frame.ray(column, line) * depth_sigma[..., None]
     travel = travel_at(frame.travel, line) - travel_at(frame.travel, line.new_zeros(()))
     sigma = torch.hypot(along_ray, travel[..., None] * motion_sigma(frame.n, covariance))
     if frame.travel.sigma_mm is not None:
         sigma[..., 1] = sigma[..., 1].hypot(frame.stretch * travel_sigma(frame.travel, line))
+    if frame.line_motion is not None and z is not None:
+        by_motion = frame.displacement_jacobian(column, line, z)
+        spread = (by_motion @ frame.line_motion.covariance_at(line) * by_motion).sum(-1)
+        sigma = sigma.hypot(spread.clamp(min=0).sqrt())
     return sigma
 
 

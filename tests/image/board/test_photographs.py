@@ -1,6 +1,7 @@
 """Corners of real photographs: all boards found, and the stereo baseline that was published for them."""
 
 import json
+from functools import cache
 from pathlib import Path
 
 import cv2
@@ -16,6 +17,7 @@ BOARD = Board(10, 7, 30.0)
 PRECISELY = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 200, 1e-9)
 
 
+@cache
 def corners_of(folder: Path, name: str) -> DetectedCorners:
     image = cv2.imread(str(folder / name), cv2.IMREAD_GRAYSCALE)
     detected = detect_board(TensorImage(torch.from_numpy(image)[..., None]), BOARD)

@@ -42,9 +42,8 @@ def grid() -> Tensor:
 
 def test_values_by_hand():
     # Sharp edges along the axes, contrast 10 on 50 with slope 2 along u. The first pixel lies a quarter of a pixel
-    # right of one edge and a tenth below the other: three quarters less one quarter of it are bright,
-    # six tenths less four.
-    # Right of the first edge lies another 4, more of it further down.
+    # right of one edge and a tenth below the other: three quarters less one quarter of it are bright, six tenths less
+    # four. Right of the first edge lies another 4, more of it further down.
     parameters = torch.tensor([[0.5, -0.25, 0.0, math.pi / 2, 1e-4, 50, 2, 0, 4, 0, 1, 0, 0, 0, 10, 0, 0]]).double()
     grid = torch.tensor([[0.75, 0.5], [-0.15, -0.25]]).double()
     values = Saddle.on_grid(SaddleParameters(parameters), grid).values()

@@ -1,6 +1,8 @@
 """Small files that claim to hold any amount: refused before it is decoded."""
 
+import gzip
 import json
+import os
 import struct
 import zlib
 from pathlib import Path
@@ -85,6 +87,58 @@ def test_compressed_twice_or_in_a_way_that_tells_no_size(tmp_path):
         zarr_image(tmp_path / "bz2", zarr_format=2, compressors=numcodecs.BZ2())
 
 
+def zstd_of_unsaid_size(blocks: int) -> bytes:
+    """A frame of Zstandard whose header does not give its size, of so many blocks of 128 KB of zeros."""
+    block = 1 << 1 | 131_071 << 3  # all its bytes are the one that follows
+    body = (struct.pack("<I", block)[:3] + b"\0") * (blocks - 1) + struct.pack("<I", 1 | block)[:3] + b"\0"
+    return b"\x28\xb5\x2f\xfd\x00\x58" + body
+
+
+@pytest.mark.parametrize("before", [b"", struct.pack("<II", 0x184D2A50, 4) + b"skip"], ids=["alone", "after another"])
+def test_a_zstandard_frame_that_does_not_say_its_size(tmp_path, before):
+    path = zarr_image(tmp_path / "a.zarr", compressors=[ZstdCodec()])
+    (path / "c" / "1" / "0" / "0").write_bytes(before + zstd_of_unsaid_size(1000))
+    with pytest.raises(FileFormatError, match=r"chunk c/1/0/0 holds more than its 960 bytes"):
+        open_line_image(path).read(10, 30)
+
+
+def test_a_gzip_file_within_a_gzip_chunk(tmp_path):
+    lines = 40_000_000
+    path = tmp_path / "a.zarr"
+    zarr.create_array(path, shape=(lines, 1), chunks=(lines, 1), dtype="uint8", compressors=[GzipCodec()])
+    (path / "c" / "0").mkdir(parents=True)
+    # The second would go on for as long as it likes: only its length is looked at.
+    (path / "c" / "0" / "0").write_bytes(gzip.compress(b"") + gzip.compress(bytes(100 * MB)))
+    with pytest.raises(FileFormatError, match=r"chunk c/0/0 holds more than its 40000000 bytes"):
+        open_line_image(path).read(0, 1)
+
+
+@pytest.mark.parametrize("compressor", [ZstdCodec(), None], ids=["zstd", "plain"])
+def test_a_chunk_whose_file_is_enormous(tmp_path, compressor):
+    path = zarr_image(tmp_path / "a.zarr", compressors=compressor)
+    os.truncate(path / "c" / "1" / "0" / "0", 2**40)  # takes no room
+    with pytest.raises(FileFormatError, match=r"chunk c/1/0/0 holds more than its 960 bytes"):
+        open_line_image(path).read(10, 30)
+
+
+@pytest.mark.parametrize("dtype", ["uint8", "float32"])
+@pytest.mark.parametrize("missing_lines", ["refuse", "mark"])
+def test_more_chunks_than_any_scan_has(tmp_path, dtype, missing_lines):
+    path = tmp_path / "a.zarr"
+    zarr.create_array(path, shape=(10**9, 16), chunks=(1, 16), dtype=dtype)
+    with pytest.raises(FileFormatError, match="expected at most 10000000 chunks, got 1000000000"):
+        open_line_image(path, missing_lines)
+
+
+@pytest.mark.parametrize("name", ["gzip", "bz2", "base64"])
+def test_filters_that_tell_no_size(tmp_path, name):
+    path = zarr_image(tmp_path / "a.zarr", zarr_format=2, compressors=None)
+    metadata = json.loads((path / ".zarray").read_text())
+    (path / ".zarray").write_text(json.dumps({**metadata, "filters": [{"id": name}]}))
+    with pytest.raises(FileFormatError, match="expected filters among transpose, shuffle, delta"):
+        open_line_image(path).read(0, 1)
+
+
 def test_a_zarr_image_of_enormous_chunks(tmp_path):
     path = zarr_image(tmp_path / "a.zarr")
     metadata = json.loads((path / "zarr.json").read_text())
@@ -126,6 +180,18 @@ def test_a_strip_whose_jpeg_is_larger(tmp_path):
     (tmp_path / "a.tif").write_bytes(content)
     with pytest.raises(FileFormatError, match="the JPEG image of strip or tile 0 is larger than that"):
         open_line_image(tmp_path / "a.tif").read(0, 40)
+
+
+@pytest.mark.parametrize("options", [{"rowsperstrip": 1}, {"tile": (16, 16)}], ids=["strips", "tiles"])
+def test_a_tiff_of_more_strips_than_it_has(tmp_path, options):
+    """Nothing is made of each of the strips that it claims."""
+    tifffile.imwrite(tmp_path / "a.tif", PIXELS, photometric="rgb", compression="zlib", **options)
+    content = bytearray((tmp_path / "a.tif").read_bytes())
+    place = content.index(struct.pack("<H", 257))  # lines
+    content[place + 2 : place + 12] = struct.pack("<HII", 4, 1, 4_000_000_000)
+    (tmp_path / "a.tif").write_bytes(content)
+    with pytest.raises(FileFormatError, match=r"expected (4000|250)000000 strips or tiles, got (40|3)"):
+        open_line_image(tmp_path / "a.tif")
 
 
 @pytest.mark.parametrize("kind", ["jpeg2000", "webp", "png"])

@@ -8,18 +8,20 @@ import torch
 
 from lsvision.estimation import mean_chi_square_band, nees, upper_root
 from lsvision.estimation.gaussian_process import covariance_root
+from lsvision.stages.calibration.along_scan import SUSPICION, Linearised, by_chance, with_processes
+from lsvision.stages.calibration.along_scan.evidence import NormalEquations
+from lsvision.stages.calibration.along_scan.kernels import INTERVALS, KNOTS, kernel_family, wave_length
+from lsvision.stages.calibration.along_scan.lines import Travel, directions
 from lsvision.stages.calibration.calibrate import calibrate, calibrate_batch
 from lsvision.stages.calibration.config import CalibrationConfig
-from lsvision.stages.calibration.correlated import suspicious, with_processes
-from lsvision.stages.calibration.evidence import NormalEquations, Travel
-from lsvision.stages.calibration.kernels import INTERVALS, KNOTS, kernel_family, wave_length
 from lsvision.stages.calibration.linearise import linearise, point_factor
 from lsvision.stages.calibration.methods import joint
 from lsvision.stages.calibration.model import residuals_in_sigmas, whitened_residuals
+from lsvision.stages.calibration.verdict import UNLIKE
 from tests.stages.calibration.boards import RIG, Corners, simulate
 
-ROUGH, SMOOTH, WAVE = 3, 7, 30  # of the kernel family
-SIDEWAYS, TRAVEL, DEPTH = range(3)
+ROUGH, SMOOTH, WAVE = 1, 4, 13  # of the kernel family
+SIDEWAYS, TRAVEL, DEPTH, ROLL = range(4)
 
 
 def shaken(corners: Corners, rms_mm: float, wavelength_mm: float, components=(SIDEWAYS, DEPTH)) -> Corners:
@@ -44,16 +46,16 @@ def errors(corners: Corners, found) -> torch.Tensor:
 
 def dense_covariance(problem, roots: torch.Tensor) -> torch.Tensor:
     """Covariance of all points of each board, its white noise and the processes together."""
-    weights = Travel.of(problem).weights(problem)
+    weights, moved = Travel.of(problem).weights(problem), directions(problem)
     boards, corners = problem.valid.shape
     whole = torch.zeros(boards, corners, 3, corners, 3, dtype=torch.float64)
     for board in range(boards):
         for corner in range(corners):
             chol = problem.noise_chol[board, corner]
             whole[board, corner, :, corner, :] += chol @ chol.mT
-        for component in range(3):
-            part = weights[board] @ roots[component]
-            whole[board, :, component, :, component] += part @ part.mT
+        for component in range(4):
+            part = (moved[board, :, component, :, None] * (weights[board] @ roots[component])[:, None]).flatten(0, 1)
+            whole[board] += (part @ part.mT).reshape(corners, 3, corners, 3)
     return whole.reshape(boards, 3 * corners, 3 * corners)
 
 
@@ -77,8 +79,8 @@ def small_problem():
 
 def some_roots() -> torch.Tensor:
     family = kernel_family()
-    kernels = torch.stack([family.covariance[k] for k in (ROUGH, SMOOTH, WAVE)])
-    return covariance_root(kernels * torch.tensor([0.05, 0.1, 0.03]).double().square()[:, None, None])
+    kernels = torch.stack([family.covariance[k] for k in (ROUGH, SMOOTH, WAVE, SMOOTH)])
+    return covariance_root(kernels * torch.tensor([0.05, 0.1, 0.03, 0.04]).double().square()[:, None, None])
 
 
 def test_reduced_rows_are_those_of_the_dense_covariance():
@@ -109,16 +111,17 @@ def test_reduced_rows_are_those_of_the_dense_covariance():
 def test_evidence_is_the_restricted_likelihood_of_dense_covariances():
     problem, start = small_problem()
     posterior = joint(problem, start, CalibrationConfig())
-    equations = NormalEquations.of(problem, posterior.mean, prior_sigma=0.05)
+    equations = NormalEquations.of(problem, Linearised.of(problem, posterior.mean, prior_sigma=0.05))
     standing = some_roots()
     family = kernel_family()
     variance = torch.tensor([1e-4, 2e-3], dtype=torch.float64)
-    given = equations.given(TRAVEL, torch.tensor([SIDEWAYS, DEPTH]), standing[[SIDEWAYS, DEPTH]][None])
+    others = [SIDEWAYS, DEPTH, ROLL]
+    given = equations.given(TRAVEL, torch.tensor(others), standing[others][None])
     ratios = equations.log_ratios(given, family, variance)
 
     def naive(root: torch.Tensor) -> torch.Tensor:
         """-2 log likelihood, the poses and n marginalised, by the whitened rows of the whole state."""
-        roots = torch.stack([standing[SIDEWAYS], root, standing[DEPTH]])
+        roots = torch.stack([standing[SIDEWAYS], root, *standing[[DEPTH, ROLL]]])
         noise = with_processes(problem, roots[None])
         correlated = dataclasses.replace(problem, correlated=noise)
         rows = linearise(correlated, posterior.mean, point_factor(posterior.mean)).matrix
@@ -169,7 +172,7 @@ def test_a_suspicion_falls_on_few_sound_sets_and_on_all_shaken_ones():
     for measured, share in ((corners, (0.0, 0.03)), (shaken(corners, 0.03, 233.0), (0.99, 1.0))):
         problem, start = measured.problem()
         posterior = joint(problem, start, CalibrationConfig())
-        suspected = suspicious(problem, residuals_in_sigmas(problem, posterior.mean)).double().mean()
+        suspected = (by_chance(problem, residuals_in_sigmas(problem, posterior.mean)) < SUSPICION).double().mean()
         assert share[0] <= suspected <= share[1]
 
 
@@ -232,6 +235,72 @@ def test_what_was_allowed_for_is_said():
     assert error.in_words.startswith("errors along the scan: 0.0")
     assert " mm rms sideways, about 1" in error.in_words
     assert calibrate(simulate().boards(), RIG, CalibrationConfig()).errors_along_scan == ()
+
+
+def rolled(corners: Corners, rms_mm: float, wavelength_mm: float) -> Corners:
+    """The same corners, all of one line turned together about the travel, by an axis half a metre below the board."""
+    points, travel = corners.points.clone(), corners.points[..., 1]
+    lever = corners.points[..., 0] - corners.points[..., 0].mean()
+    phase = 2 * math.pi * torch.rand(*travel.shape[:-1], 1, dtype=torch.float64)
+    angle = (
+        math.sqrt(2) * torch.sin(2 * math.pi * travel / wavelength_mm + phase) * rms_mm / lever.square().mean().sqrt()
+    )
+    points[..., 0] -= angle * (corners.points[..., 2].mean() + 500.0 - corners.points[..., 2])
+    points[..., 2] -= angle * lever
+    return dataclasses.replace(corners, points=points)
+
+
+def turned_about_the_view(corners: Corners, rms_rad: float, wavelength_mm: float) -> Corners:
+    """The same corners, each line's travel wrong in proportion to the place across it, which no component describes."""
+    points, travel = corners.points.clone(), corners.points[..., 1]
+    phase = 2 * math.pi * torch.rand(*travel.shape[:-1], 1, dtype=torch.float64)
+    angle = rms_rad * math.sqrt(2) * torch.sin(2 * math.pi * travel / wavelength_mm + phase)
+    points[..., 1] += angle * (points[..., 0] - points[..., 0].mean(-1, keepdim=True))
+    return dataclasses.replace(corners, points=points)
+
+
+def rough(corners: Corners, rms_mm: float, length_mm: float, components=(SIDEWAYS, DEPTH)) -> Corners:
+    """The same corners, all of one line displaced together: by a process whose correlation falls exponentially."""
+    points, travel = corners.points.clone(), corners.points[..., 1]
+    distance = (travel[..., :, None] - travel[..., None, :]).abs()
+    root = torch.linalg.cholesky(torch.exp(-distance / length_mm) + 1e-9 * torch.eye(travel.shape[-1]).double())
+    for component in components:
+        points[..., component] += rms_mm * (root @ torch.randn(*travel.shape, 1, dtype=torch.float64))[..., 0]
+    return dataclasses.replace(corners, points=points)
+
+
+def test_a_turn_about_the_travel_is_found_as_one():
+    torch.manual_seed(10)
+    corners = rolled(simulate(), 0.05, 150.0)
+    result = calibrate(corners.boards(), RIG, CalibrationConfig())
+    assert result.verdict == "determined"
+    (roll,) = (error for error in result.errors_along_scan if error.component == "roll")
+    assert roll.rms_mm == pytest.approx(0.05, rel=0.5)
+    assert "by a turn about the travel" in roll.in_words
+    assert nees(result.motion.n - corners.n, torch.linalg.cholesky(result.motion.covariance)) < 16.3
+
+
+def test_errors_that_no_component_describes_are_a_contradiction():
+    torch.manual_seed(11)
+    result = calibrate(turned_about_the_view(simulate(), 3e-4, 150.0).boards(), RIG, CalibrationConfig())
+    assert result.verdict == "inconsistent"
+    assert UNLIKE in result.reasons
+
+
+@pytest.mark.slow
+def test_errors_that_are_modelled_are_rarely_said_to_be_unlike_any():
+    torch.manual_seed(12)
+    sets = simulate(batch=(20,))
+    for corners in (shaken(sets, 0.03, 150.0), rough(sets, 0.05, 60.0)):
+        assert solved(corners).along_scan_unlike.sum() <= 1
+    assert solved(turned_about_the_view(sets, 3e-4, 150.0)).along_scan_unlike.double().mean() > 0.9
+
+
+@pytest.mark.slow
+def test_normalised_errors_under_a_correlation_of_60_mm_keep_their_band():
+    torch.manual_seed(13)
+    corners = rough(simulate(batch=(200,)), 0.03, 60.0)
+    assert 2.5 < errors(corners, solved(corners)).mean() < 3.6
 
 
 @pytest.mark.slow

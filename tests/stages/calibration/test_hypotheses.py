@@ -6,9 +6,16 @@ from dataclasses import replace
 import pytest
 import torch
 
-from lsvision.stages.calibration.causes import NONE, candidates, wanders
-from lsvision.stages.calibration.departure_fit import Beliefs, Hypothesis, fit
-from lsvision.stages.calibration.departures import KINDS, Placement, ReducedCorners, placement, residual_and_jacobian
+from lsvision.stages.calibration.along_scan import COMPONENTS
+from lsvision.stages.calibration.causes import NONE, candidates
+from lsvision.stages.calibration.departures import (
+    KINDS,
+    Placement,
+    ReducedCorners,
+    corner_rows,
+    placement,
+    residual_and_jacobian,
+)
 from lsvision.stages.calibration.hypotheses import Assumed, explain
 from tests.stages.calibration.boards import SIGMA, simulate
 from tests.stages.calibration.contradictions import (
@@ -31,21 +38,23 @@ FAST = 4
 
 def posed(corners):
     problem, start = corners.problem()
-    return ReducedCorners.of(problem).scaled(), placement(problem, start)
+    return problem, ReducedCorners.of(problem).scaled(), placement(problem, start)
 
 
 def named(corners, assumed=PRIOR):
-    """What was named in each set: kinds of causes with the number of their scan, and of a wander."""
-    reduced, start = posed(corners)
-    found = explain(reduced, start, assumed)
-    causes, choices = candidates(start.position.shape[-2], reduced.curved, start.n), wanders(reduced.curved)
+    """What was named in each set: kinds of causes with the number of their scan, and of errors along the scan."""
+    problem, reduced, start = posed(corners)
+    found = explain(problem, reduced, start, assumed)
+    causes = candidates(start.position.shape[-2], reduced.curved, start.n)
     names = []
     for i in range(len(found.gain)):
         chosen = [causes[number] for number in found.causes[:, i].tolist() if number != NONE]
         words = [cause.kind if cause.scan == NONE else f"{cause.kind} {cause.scan}" for cause in chosen]
         rivals = {causes[k].kind for k in found.rivals[:, i].nonzero().flatten().tolist()}
-        wander = int(found.wander[i])
-        names.append((words + ([] if wander == NONE else [choices[wander].kind]), rivals))
+        along = found.along_scan[i]
+        if along is not None:
+            words.append("encoder" if COMPONENTS[int(along.rms_mm.argmax())] == "travel" else "shake")
+        names.append((words, rivals))
     return names
 
 
@@ -147,8 +156,8 @@ def test_a_size_within_its_stated_sigma_is_no_contradiction():
 @pytest.mark.slow
 def test_departures_come_out_with_their_sigmas():
     torch.manual_seed(9)
-    reduced, start = posed(faster(THREE, (1.00, 1.03, 1.06), 200))
-    found = explain(reduced, start, Assumed(0.05))
+    problem, reduced, start = posed(faster(THREE, (1.00, 1.03, 1.06), 200))
+    found = explain(problem, reduced, start, Assumed(0.05))
     speed, covariance = found.departure[..., 0], found.covariance[:, 0]
     for scan, truth in ((1, 0.03), (2, 0.06)):
         ratio = (1 + speed[:, scan]) / (1 + speed[:, 0])
@@ -160,47 +169,42 @@ def test_departures_come_out_with_their_sigmas():
 def test_batch_equals_loop():
     torch.manual_seed(10)
     corners = faster(THREE, (1.00, 1.03, 1.06), 4)
-    reduced, start = posed(corners)
-    together = explain(reduced, start, Assumed(0.05))
+    problem, reduced, start = posed(corners)
+    together = explain(problem, reduced, start, Assumed(0.05))
     for i in (1, 3):
         chosen = torch.arange(4) == i
-        part = Placement(
-            *(getattr(start, name)[chosen] for name in ("rotation", "position", "n", "departure", "wander"))
-        )
-        alone = explain(reduced.taken(chosen), part, Assumed(0.05))
+        one = posed(replace(corners, points=corners.points[chosen], covariance=corners.covariance[chosen],
+                            board_points=corners.board_points[chosen], valid=corners.valid[chosen]))  # fmt: skip
+        alone = explain(*one, Assumed(0.05))
         assert torch.equal(alone.causes[:, 0], together.causes[:, i])
         torch.testing.assert_close(alone.departure[0], together.departure[i], rtol=0, atol=1e-9)
 
 
 def test_jacobian_is_the_derivative_of_the_residuals():
     torch.manual_seed(11)
-    reduced, start = posed(simulate(batch=(1,)))
-    at = Placement(start.rotation, start.position, start.n, start.departure + 0.01, start.wander + 0.02)
+    _, reduced, start = posed(simulate(batch=(1,)))
+    at = Placement(start.rotation, start.position, start.n, start.departure + 0.01)
     rows = residual_and_jacobian(reduced, at)
     J = rows[..., :-1]
-    sizes = [6, 3, len(KINDS), start.wander.shape[-1]]
-    for column in (*range(16), 18, J.shape[-1] - 1):
+    for column in range(16):
         move = torch.zeros(1, 3, J.shape[-1], dtype=torch.float64)
         move[..., column] = 1e-6
-        pose, n, departure, wander = move.split(sizes, dim=-1)
-        up = residual_and_jacobian(reduced, at.moved(pose, n[:, 0], departure, wander))[..., -1]
-        down = residual_and_jacobian(reduced, at.moved(-pose, -n[:, 0], -departure, -wander))[..., -1]
+        pose, n, departure = move.split([6, 3, len(KINDS)], dim=-1)
+        up = residual_and_jacobian(reduced, at.moved(pose, n[:, 0], departure))[..., -1]
+        down = residual_and_jacobian(reduced, at.moved(-pose, -n[:, 0], -departure))[..., -1]
         numeric = (down - up) / 2e-6
         torch.testing.assert_close(numeric, J[..., column], rtol=1e-4, atol=1e-5 * float(J[..., column].abs().max()))
 
 
-def test_wander_at_the_knots_is_what_is_added_to_the_corners():
-    """Values that differ from line to line, added to the measured points of a flat board, leave no residual."""
+def test_rows_of_the_corners_are_those_of_the_reduced_ones():
+    """In sigmas their products agree, but for shifts of the board and what no features explain."""
     torch.manual_seed(12)
-    corners = simulate([(0.0, 0.0, 0.0)], (1,), (0.0, 0.0, 0.0))
-    corners = replace(corners, covariance=simulate([(0.0, 0.0, 0.0)], (1,)).covariance)
-    problem, start = corners.problem()
-    nothing = Hypothesis(start.new_zeros(1, len(KINDS), 0), start.new_zeros(0))
-    at = fit(ReducedCorners.of(problem), placement(problem, start), nothing, Beliefs(0.05)).at
-    values = 0.01 * torch.randn(8, 3, dtype=torch.float64) * torch.tensor([1.0, 0.0, 1.0])
-    travel = corners.points[..., 1]
-    line = ((travel - travel.amin()) / (travel.amax() - travel.amin()) * 7).round().long()
-    moved = ReducedCorners.of(replace(problem, points=problem.points + values[line]))
-    still = residual_and_jacobian(moved, at)[..., -1]
-    wandering = residual_and_jacobian(moved, replace(at, wander=values.flatten().expand_as(at.wander)))[..., -1]
-    assert wandering.square().sum() < 1e-4 * still.square().sum()
+    problem, reduced, start = posed(simulate(batch=(1,)))
+    at = Placement(start.rotation, start.position, start.n, start.departure + 0.01)
+    whitened = torch.linalg.solve_triangular(problem.noise_chol, corner_rows(problem, at), upper=False).flatten(2, 3)
+    products = []
+    for rows in (whitened, residual_and_jacobian(reduced, at)):
+        shifts = torch.linalg.qr(rows[..., 3:6]).Q
+        unshifted = rows - shifts @ (shifts.mT @ rows)
+        products.append((unshifted.mT @ unshifted)[..., :-1, :])
+    torch.testing.assert_close(*products)

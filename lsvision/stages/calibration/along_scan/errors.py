@@ -1,0 +1,92 @@
+"""Errors along the scans of a batch of problems: whether residuals look like them, and the noise that they make."""
+
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from lsvision.estimation.gaussian_process import covariance_root
+from lsvision.stages.calibration.along_scan.check import SUSPICION, can_be
+from lsvision.stages.calibration.along_scan.evidence import Linearised
+from lsvision.stages.calibration.along_scan.kernels import wave_length
+from lsvision.stages.calibration.along_scan.lines import COMPONENTS, Travel, latents
+from lsvision.stages.calibration.along_scan.search import Beforehand, search
+from lsvision.stages.calibration.problem import BoardProblem
+from lsvision.stages.calibration.reduction import CorrelatedNoise, affine_features, rows_with_latents
+
+# Probability of residuals below which they are no noise, though no errors along the scan were found.
+_BEYOND_DOUBT = 1e-4
+
+
+@dataclass(frozen=True)
+class ErrorsAlongScan:
+    """The errors along the scans of a batch of problems, zero where none were ``found``.
+
+    Those that are ``unlike`` any process that was tried have sigmas that need not cover what they do to n. ``rms_mm``
+    and ``length_mm`` are those of each component: the length of a wave as correlated. ``noise`` is the corners' noise
+    with these errors, None where none were found in any problem, as given where they were in others.
+    """
+
+    found: Bool[Tensor, "*batch"]
+    unlike: Bool[Tensor, "*batch"]
+    rms_mm: Float[Tensor, "*batch 4"]
+    length_mm: Float[Tensor, "*batch 4"]
+    noise: CorrelatedNoise | None
+
+    def problem(self, problem: BoardProblem) -> BoardProblem:
+        """Those of the problems in which errors were found, in a row, with their noise."""
+        return replace(problem, correlated=self.noise).at(self.found)
+
+
+def errors_along_scan(
+    problem: BoardProblem,
+    state: Float[Tensor, "*batch state"],
+    probability: Float[Tensor, "*batch"],
+    prior_sigma: float,
+    known: Beforehand,
+) -> ErrorsAlongScan:
+    """The errors along the scan for which residuals give evidence.
+
+    Problems are looked at one by one, so that no bit of one depends on the others, and the doubtful ones alone, as each
+    takes a tenth of a second.
+
+    Args:
+        state: of the problems with white noise.
+        probability: of residuals as much correlated, see ``by_chance``.
+        prior_sigma: of each component of n.
+    """
+    rms, length = (state.new_zeros(*state.shape[:-1], len(COMPONENTS)) for _ in range(2))
+    doubtful = probability < SUSPICION
+    found, unlike = doubtful.clone(), torch.zeros_like(doubtful)
+    if not bool(found.any()):
+        return ErrorsAlongScan(found, unlike, rms, length, None)
+    rows, log_det = problem.affine_rows.clone(), problem.noise_log_det.clone()
+    for index in doubtful.nonzero():
+        place = tuple(index.tolist())
+        one = problem.at(place)
+        linearised = Linearised.of(one, state[place], prior_sigma)
+        errors = search(one, linearised, known)
+        if errors is None:
+            found[place] = False
+            unlike[place] = (probability[place] < _BEYOND_DOUBT) & (known.process_sigma == 0)
+            continue
+        rms[place] = errors.rms_mm
+        length[place] = wave_length(errors.covariance) * Travel.of(one).extent_mm
+        roots = covariance_root(errors.noise)
+        unlike[place] = not can_be(one, linearised, roots)
+        noise = with_processes(one, roots)
+        rows[place], log_det[place] = noise.rows, noise.log_det
+    return ErrorsAlongScan(found, unlike, rms, length, CorrelatedNoise(rows, log_det) if bool(found.any()) else None)
+
+
+def with_processes(problem: BoardProblem, roots: Float[Tensor, "_ 4 knots columns"]) -> CorrelatedNoise:
+    """The noise of a problem's corners and of a process per board and component, given by its root at the knots, mm.
+
+    Args:
+        problem: of batch shape ().
+    """
+    features = affine_features(problem.body_points)
+    by_latents = latents(problem, roots)
+    noise = rows_with_latents(problem.noise_chol, problem.points, features, problem.valid, by_latents)
+    return CorrelatedNoise(noise.rows, problem.noise_log_det + noise.log_det)

@@ -1,0 +1,1 @@
+"""Scan, depth and motion -> motion from line to line."""

@@ -1,0 +1,42 @@
+"""Options of the motion from line to line."""
+
+from dataclasses import dataclass
+
+from lsvision.schema import Checked, Interval, IntFrom2, NonNegative, Positive, PositiveInt, Share
+
+
+@dataclass(frozen=True)
+class LineMotionConfig(Checked):
+    """How the motion from line to line is measured on the profile of an object that is the same all along, as a rail.
+
+    The reference is the object's own robust mean profile over up to ``reference_lines`` lines, as deep as
+    ``profile_depth_mm`` under its crown: what lies deeper need not move with it. Depths outside ``height_range_mm``
+    count as not measured. Every line is registered to it in ``iterations`` of Gauss-Newton steps; a sample counts the
+    less the further it lies off, and not at all beyond ``cut_sigma`` of its standard deviations: defects are outliers.
+    Of the columns at most ``samples`` are used, as neighbours err alike. A line of which less than ``min_share`` of the
+    object's samples was measured is interpolated from the others; so are all lines of which too few are left.
+    The errors of a line follow from its halves, which see the same motion; ``common_error_px`` of disparity is what a
+    line's depths err by all together (on rendered rails 0.005 to 0.013). ``expected_x_mm``, ``expected_z_mm`` and
+    ``expected_roll_deg`` are what vibration usually amounts to (rms): they keep apart what the profile does not tell
+    apart, as roll and sideways motion of a crown. A component that a line shows no better than to twice that is not
+    observed. ``evidence`` is how much better, in units of the logarithm of the likelihood, the lines must fit with a
+    component for it to be corrected; and it must be ``least_ratio`` times the errors of a single line at least, as
+    errors of the matching may last for many lines.
+    Lines are smoothed in blocks of ``block_lines`` with ``halo_lines`` on either side.
+    """
+
+    height_range_mm: Interval = (-60.0, 60.0)
+    profile_depth_mm: Positive = 40.0
+    reference_lines: IntFrom2 = 512
+    samples: PositiveInt = 600
+    iterations: IntFrom2 = 6
+    cut_sigma: Positive = 4.0
+    min_share: Share = 0.3
+    common_error_px: NonNegative = 0.01
+    expected_x_mm: Positive = 0.2
+    expected_z_mm: Positive = 0.2
+    expected_roll_deg: Positive = 0.02
+    evidence: NonNegative = 12.0
+    least_ratio: NonNegative = 1.0
+    block_lines: PositiveInt = 256
+    halo_lines: PositiveInt = 192
