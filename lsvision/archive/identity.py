@@ -52,7 +52,7 @@ def stamp_of(folder: Path) -> str:
     stamps = []
     try:
         for file in scan_files(folder):
-            with suppress(FileNotFoundError):
+            with suppress(FileNotFoundError, ValueError):  # a name with a null character is that of no file
                 state = file.stat()
                 stamps.append((str(file), state.st_size, state.st_mtime_ns, state.st_ino))
     except OSError as error:

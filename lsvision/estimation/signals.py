@@ -35,7 +35,7 @@ class NoisyValues:
 
     values: Float[Tensor, "samples *batch signals"]
     root: Float[Tensor, "samples *batch signals signals"]
-    valid: Bool[Tensor, "*batch"]
+    valid: Bool[Tensor, "samples *batch"]
 
     def at(self, samples: Tensor) -> "NoisyValues":
         """Samples by their numbers; those beyond either end were not measured."""

@@ -77,6 +77,7 @@ def run_command() -> None:
     print_any_letter()
     known, sys.argv = sys.argv, [sys.argv[0]]
     own_handling = os.environ.get("HYDRA_FULL_ERROR")
+    logging.raiseExceptions = False  # a log that cannot be written, on a full disk, must not bury the error
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra's errors come here instead of being printed with its search paths
     try:
         sys.argv += quoted(known[1:])
@@ -84,7 +85,7 @@ def run_command() -> None:
     except EXPECTED as error:
         raise SystemExit(_report(error)) from None
     finally:
-        sys.argv = known
+        sys.argv, logging.raiseExceptions = known, True
         if own_handling is None:
             del os.environ["HYDRA_FULL_ERROR"]
 

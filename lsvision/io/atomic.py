@@ -29,10 +29,13 @@ def naming_full_disk(target: Path | str) -> Iterator[None]:
 def partial_file(target: Path | str) -> Iterator[Path]:
     """Yield a hidden path beside ``target`` to write to; it takes the target's name on success, else it is removed.
 
+    A link in the target's place is replaced: what it leads to, anywhere, is not written to.
+
     Raises:
         WriteError: the disk is full.
     """
-    target = Path(target).resolve()
+    target = Path(target)
+    target = target.parent.resolve() / target.name
     target.parent.mkdir(parents=True, exist_ok=True)
     partial = _hidden_sibling(target)
     try:

@@ -22,9 +22,10 @@ class LineFinding:
 
     ``state`` is ``corrected``; ``absent``, where nothing above the noise was there; or ``not observed``, where the
     object's shape does not show it. ``rms`` is that of the component, ``sigma`` the rms of its standard deviations over
-    the lines, mm or rad; ``length_mm`` is the length along the travel over which it changes. ``evidence`` is how much
-    better the data fit with the component than without, in units of the logarithm of the likelihood. ``reason`` says
-    why nothing was observed, where that is not the object's shape.
+    the lines, and of the errors of single lines where it is not corrected, mm or rad; ``length_mm`` is the length along
+    the travel over which it changes. ``evidence`` is how much better the data fit with the component than without, in
+    units of the logarithm of the likelihood. ``reason`` says why nothing was observed, where that is not the object's
+    shape.
     """
 
     component: LineComponent
@@ -40,9 +41,10 @@ class LineFinding:
         """What was found, for a reader."""
         name, (unit, scale) = _NAMES[self.component], _SHOWN[self.component]
         if self.state == "absent":
-            return f"{name}: no vibration above the noise"
+            return f"{name}: nothing above the errors of a line, {self.sigma * scale:.2g} {unit}"
         if self.state == "not observed":
-            return f"{name}: not observed, {self.reason}"
+            error = f" better than to {self.sigma * scale:.2g} {unit}" if self.sigma > 0 else ""
+            return f"{name}: not observed, {self.reason}{error}"
         length = "" if self.length_mm is None else f", over lengths of {self.length_mm:.2g} mm"
         known = f"known to {self.sigma * scale:.2g} {unit}" if self.sigma > 0 else "of unknown sigma"
         return f"{name}: {self.rms * scale:.2g} {unit} rms, {known}{length}"

@@ -1,6 +1,7 @@
 """What a person types wrongly, or in another language: one line, and an exit code that says which."""
 
 import io
+import logging
 import os
 import signal
 import subprocess
@@ -8,6 +9,7 @@ import sys
 import time
 from pathlib import Path
 
+import psutil
 import pytest
 
 from lsvision.archive import LEDGER_FILE, Ledger, ScanRow, sole_run
@@ -28,6 +30,11 @@ REPROCESS = ("+experiment=reprocess", "calibration=c.json")
         (["+experiment=calibrate", "scans=[5]"], "scans[0]: expected text, got 5"),
         (["+experiment=calibrate", "scans=5"], "scans: expected a list, got 5"),
         (["+experiment=correct", "scan=a", "calibration=c.json", "export=[obj]"], "export[0]: expected 'tiff', 'ply'"),
+        ([*REPROCESS, "archive='reference://'", "output=o"], "archive: reference:// cannot be read: "),
+        (
+            [*REPROCESS, "archive=.", "output=o", "engine=dask", "engine.scheduler=garbage"],
+            "engine.scheduler: expected an address as tcp://host:8786, got 'garbage'",
+        ),
         ([*REPROCESS, "archive=.", "output=o", "engine.workers=-1"], "engine.workers: expected a whole number >= 1"),
         (["+experiment=calibrate", "scans=[a"], "scans=[a: cannot be understood; put quotes"),
         (["+experiment=correct", "scan=a(b", "calibration=c.json"], "scan=a(b: cannot be understood"),
@@ -77,6 +84,15 @@ def test_a_folder_that_cannot_be_made_for_the_run(tmp_path, monkeypatch, capsys)
     assert stop.value.code == 1
     assert capsys.readouterr().err == f"error: {tmp_path}/afile/x: Not a directory\n"
     assert "HYDRA_FULL_ERROR" not in os.environ
+
+
+def test_a_log_that_cannot_be_written_does_not_bury_the_error(command, monkeypatch, capsys):
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(logging.Handler, "format", full)
+    assert command("+experiment=status", "output=nowhere") == 1
+    assert capsys.readouterr().err == "error: output: no ledger in nowhere\n"
 
 
 def test_letters_beyond_ascii_are_quoted():
@@ -149,23 +165,39 @@ def test_an_interruption_says_what_is_done(command, tmp_path, capsys, monkeypatc
     assert len(list((tmp_path / "o").glob("*.zarr"))) == 2
 
 
+def has_a_product(process: psutil.Process, output: Path) -> bool:
+    return bool(list(output.glob("*.zarr")))
+
+
+def starts_workers(process: psutil.Process, output: Path) -> bool:
+    """Whether the server of workers imports what they need, for seconds."""
+    return any("forkserver" in " ".join(child.cmdline()) for child in process.children())
+
+
 @pytest.mark.slow
-def test_ctrl_c_ends_the_program_with_130(tmp_path):
+@pytest.mark.parametrize(
+    ("number", "code", "word"), [(signal.SIGINT, 130, "interrupted: "), (signal.SIGTERM, 143, "terminated: ")]
+)
+@pytest.mark.parametrize("moment", [has_a_product, starts_workers])
+def test_a_signal_to_all_processes_is_one_line(tmp_path, moment, number, code, word):
     make_calibration(tmp_path / "c.json")
-    for number in range(20):
-        make_scan(tmp_path / "archive" / f"s{number}", 400, stereo=True)
+    for index in range(20):
+        make_scan(tmp_path / "archive" / f"s{index}", 400, stereo=True)
     options = [f"archive={tmp_path / 'archive'}", f"calibration={tmp_path / 'c.json'}", f"output={tmp_path / 'o'}"]
     program = [sys.executable, "-m", "lsvision.run", "+experiment=reprocess", *options, "engine.workers=1"]
     process = subprocess.Popen(
         [*program, f"hydra.run.dir={tmp_path / 'run'}"], stderr=subprocess.PIPE, text=True, start_new_session=True
     )
-    while process.poll() is None and not list((tmp_path / "o").glob("*.zarr")):
+    watched = psutil.Process(process.pid)
+    while process.poll() is None and not moment(watched, tmp_path / "o"):
         time.sleep(0.01)
-    os.killpg(process.pid, signal.SIGINT)
+    family = [watched, *watched.children(recursive=True)]
+    os.killpg(process.pid, number)
     _, errors = process.communicate(timeout=100)
-    assert process.returncode == 130
-    assert errors.splitlines()[-1].startswith("interrupted: ")
-    assert "Traceback" not in errors
+    assert process.returncode == code
+    assert len(errors.splitlines()) == 1
+    assert errors.startswith(word)
+    assert not psutil.wait_procs(family, timeout=30)[1]
 
 
 def test_two_runs_within_a_second_have_a_folder_each(tmp_path, monkeypatch):

@@ -172,10 +172,12 @@ def test_uneven_travel_keeps_the_order_of_lines() -> None:
 
 
 def test_findings_in_words() -> None:
-    assert LineFinding("dx", "absent").in_words == "sideways: no vibration above the noise"
+    assert LineFinding("dx", "absent", sigma=0.07).in_words == "sideways: nothing above the errors of a line, 0.07 mm"
     found = LineFinding("roll", "corrected", math.radians(0.02), math.radians(0.005), 60.0, 300.0)
     assert found.in_words == "roll: 0.02 deg rms, known to 0.005 deg, over lengths of 60 mm"
-    assert "not observed" in LineFinding("dx", "not observed").in_words
+    unseen = LineFinding("dx", "not observed", sigma=0.5).in_words
+    assert unseen == "sideways: not observed, the object's shape does not show it better than to 0.5 mm"
+    assert LineFinding("dz", "not observed", reason="why").in_words == "in depth: not observed, why"
     motion = random_motion(3)
     parts = torch.stack([motion.dx_mm, motion.dz_mm, motion.roll_rad, motion.dy_mm], -1)
     assert torch.equal(parts, motion.values)

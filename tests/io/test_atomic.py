@@ -89,3 +89,13 @@ def test_a_full_disk_names_the_target(tmp_path: Path, partial) -> None:
     with pytest.raises(PermissionError), partial(tmp_path / "a"):
         raise PermissionError(errno.EACCES, "not allowed")
     assert not any(tmp_path.iterdir())
+
+
+def test_a_link_is_replaced_and_what_it_leads_to_is_kept(tmp_path):
+    (tmp_path / "kept.json").write_text("kept")
+    (tmp_path / "o").mkdir()
+    (tmp_path / "o" / "a.json").symlink_to(tmp_path / "kept.json")
+    write_text(tmp_path / "o" / "a.json", "new")
+    assert (tmp_path / "kept.json").read_text() == "kept"
+    assert (tmp_path / "o" / "a.json").read_text() == "new"
+    assert not (tmp_path / "o" / "a.json").is_symlink()

@@ -9,6 +9,7 @@ import threading
 from collections import deque
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import suppress
 from multiprocessing import forkserver, resource_tracker
 from types import TracebackType
 from typing import Literal
@@ -50,6 +51,8 @@ class LocalEngine:
         self._failed_starts = 0
         resource_tracker.ensure_running()  # at its start it would make Ctrl-C visible again
         try:
+            if start_method == "forkserver":
+                self._wait_for_server()
             for _ in range(workers):
                 self._start_worker()
         except BaseException:
@@ -140,20 +143,24 @@ class LocalEngine:
         while True:
             pool = ProcessPoolExecutor(1, mp_context=self._context, initializer=_enter_worker)
             try:
-                self._busy[self._first_task(pool)] = None, pool
+                with uninterrupted(), hidden_from_children():
+                    self._busy[pool.submit(os.getpid)] = None, pool
                 return
             except (OSError, EOFError, BrokenProcessPool):  # the server that workers are forked from was killed
                 pool.shutdown(wait=False)
                 self._count_failed_start()
 
-    def _first_task(self, pool: ProcessPoolExecutor) -> Future:
-        """Start a worker's process, which Ctrl-C does not reach."""
-        if self._context.get_start_method() == "forkserver":
-            with hidden_from_children():
-                forkserver.ensure_running()  # all that it forks inherit that; they wait for its imports, interruptibly
-            return pool.submit(os.getpid)
+    def _wait_for_server(self) -> None:
+        """Wait until the server that workers are forked from has imported what they need, which may be interrupted.
+
+        A worker whose start is interrupted would print a trace for want of its queues: one without any is forked first.
+        """
         with hidden_from_children():
-            return pool.submit(os.getpid)
+            forkserver.ensure_running()  # all that it forks inherit that
+        with suppress(OSError, EOFError):  # it was killed: noticed where workers start
+            first = multiprocessing.get_context("forkserver").Process(target=os.getpid)
+            first.start()
+            first.join()
 
 
 def _forget_stdin() -> None:

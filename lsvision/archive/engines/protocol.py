@@ -1,5 +1,6 @@
 """What an engine is: it runs tasks and returns their outcomes."""
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from types import TracebackType
@@ -8,12 +9,14 @@ from typing import Literal, Protocol
 import psutil
 
 from lsvision.archive.tasks import Outcome, Task
-from lsvision.schema import Checked, PositiveInt, Text
+from lsvision.schema import Checked, PositiveInt, Text, shown
 
 # A task that crashed this many workers is given up.
 MAX_WORKER_CRASHES = 3
 WORKERS_CRASHED = f"{MAX_WORKER_CRASHES} workers crashed at it, of memory or a signal"
 MAX_FAILED_STARTS = 10
+
+_ADDRESS = re.compile(r"(?:(?:tcp|tls)://)?[^\s/]+:\d{1,5}")
 
 Finished = tuple[Task, Outcome]
 
@@ -47,10 +50,15 @@ class EngineConfig(Checked):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        if self.scheduler is not None and not _ADDRESS.fullmatch(self.scheduler):
+            raise self.fault("scheduler", f"expected an address as tcp://host:8786, got {shown(self.scheduler)}")
         files = {name: getattr(self, name) for name in ("tls_authority", "tls_certificate", "tls_key")}
         missing = [name for name, file in files.items() if file is None]
         if 0 < len(missing) < len(files):
             raise self.fault(missing[0], "missing; certificates are three files")
+        if self.scheduler is not None and self.scheduler.startswith("tls://") == bool(missing):
+            problem = "a scheduler at tls:// asks for certificates, and they for such a scheduler"
+            raise self.fault("scheduler", f"{problem}: engine.tls_authority")
 
     @property
     def tls(self) -> TlsFiles | None:

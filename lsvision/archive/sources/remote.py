@@ -7,13 +7,12 @@ import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile
 
 import fsspec
 from fsspec.implementations.local import LocalFileSystem
 
 from lsvision.archive.sources.catalogue import COPIES_FILE, PATTERN_SIGNS, SCAN_FILE
-from lsvision.errors import ConfigError, FileFormatError
+from lsvision.errors import ConfigError, FileFormatError, LsvisionError
 from lsvision.io import write_json
 from lsvision.io.formats.validation import YAML_BYTES, parse_yaml
 from lsvision.io.inside import path_inside
@@ -44,8 +43,9 @@ def local_archive(archive: str, copies: Path) -> str:
         _copy(files, str(place).rstrip("/"), copies)
     except FileFormatError as error:
         raise ConfigError(f"archive: {archive}: {error}") from error
-    # A damaged archive surfaces as the error of any library behind it.
-    except (ImportError, ValueError, OSError, RuntimeError, EOFError, NotImplementedError, BadZipFile) as error:
+    except LsvisionError:
+        raise
+    except Exception as error:  # a damaged archive or URL surfaces as that of any library behind it
         raise ConfigError(f"archive: {archive} cannot be read: {' '.join(str(error).split())}") from error
     return str(copies)
 

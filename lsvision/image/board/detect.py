@@ -23,6 +23,7 @@ from lsvision.types import Board, LineImage, TensorImage, missing_ranges
 _REDUCED_WIDTH = 900  # columns in which the coarse search runs: squares of a full-field board still have 40 px
 _REDUCED_RADIUS = 6  # of windows of the reduced copy, px
 _RIM_PX = 8  # of the reduced copy: nearer to its rim a saddle may be missed
+_FEWEST_OF_OPENCV = 3  # corners along a side of the boards that it looks for
 _REDUCE_LINES = 64  # as many as stay in the processor's cache
 
 
@@ -163,6 +164,12 @@ def find_lattice(brightness: Float[Tensor, "lines width"], inner: tuple[int, int
     """Corners of a board, all or those that are seen, as nodes of a lattice; None where no board is seen."""
     if min(brightness.shape) < 2 * max(inner):
         return None
+    # OpenCV's need every corner, and miss boards at some angles and shears.
+    found = _found_by_opencv(brightness, inner) if min(inner) >= _FEWEST_OF_OPENCV else None
+    return found if found is not None else find_saddle_lattice(brightness, inner[0] * inner[1])
+
+
+def _found_by_opencv(brightness: Float[Tensor, "lines width"], inner: tuple[int, int]) -> SeenLattice | None:
     picture = stretch_to_bytes(brightness).numpy()
     found, corners = cv2.findChessboardCornersSB(
         picture, inner, flags=cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE
@@ -171,10 +178,7 @@ def find_lattice(brightness: Float[Tensor, "lines width"], inner: tuple[int, int
         found, corners = cv2.findChessboardCorners(
             picture, inner, flags=cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
         )
-    # Both need every corner, and miss boards at some angles and shears.
-    if found:
-        return SeenLattice.of_grid(_as_grid(corners, inner))
-    return find_saddle_lattice(brightness, inner[0] * inner[1])
+    return SeenLattice.of_grid(_as_grid(corners, inner)) if found else None
 
 
 def stretch_to_bytes(brightness: Float[Tensor, "lines width"]) -> UInt8[Tensor, "lines width"]:

@@ -107,9 +107,9 @@ def _parse(path: Path) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         raise FileFormatError(path, f"expected numbers in two columns: {error}") from error
     if table.shape[1] != 2:
         raise FileFormatError(path, f"expected two columns, got {table.shape[1]}")
-    if not np.isfinite(table).all() or (table[:, 0] < 0).any() or (table[:, 0] % 1 != 0).any():
-        row = int(np.argmin(np.isfinite(table).all(1) & (table[:, 0] >= 0) & (table[:, 0] % 1 == 0)))
-        raise FileFormatError(path, f"row {row + 2}: expected a line number and a finite position")
+    sound = np.isfinite(table).all(1) & (table[:, 0] >= 0) & (table[:, 0] == np.floor(table[:, 0]))
+    if not sound.all():
+        raise FileFormatError(path, f"row {int(np.argmin(sound)) + 2}: expected a line number and a finite position")
     table = table[np.argsort(table[:, 0], kind="stable")]
     return table[:, 0].astype(np.int64), np.ascontiguousarray(table[:, 1])
 

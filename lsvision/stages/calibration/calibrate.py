@@ -69,7 +69,7 @@ def calibrate(boards: Sequence[BoardCorners], rig: Rig, config: CalibrationConfi
     before_mm, after_mm = iterations[0].rmse_mm, iterations[-1].rmse_mm
     along_scan = errors_along_scan_of(batch)
     contradictions = [*findings.contradictions, *rmse_grew(before_mm, after_mm)]
-    if bool(batch.along_scan_unlike):
+    if bool(batch.along_scan_unlike) and not contradictions:
         contradictions.append(UNLIKE)
     if scale > 1 or along_scan:  # where the residuals are no noise as stated
         contradictions = images_exchanged(boards, rig, config, after_mm) or contradictions

@@ -15,7 +15,15 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from lsvision.estimation.gaussian_process import covariance_root
-from lsvision.stages.calibration.along_scan import Beforehand, FoundErrors, Linearised, latents, search, suspicious
+from lsvision.stages.calibration.along_scan import (
+    SUSPICION,
+    Beforehand,
+    FoundErrors,
+    Linearised,
+    by_chance,
+    latents,
+    search,
+)
 from lsvision.stages.calibration.causes import NONE, Candidate, candidates
 from lsvision.stages.calibration.departure_fit import DepartureFit, Hypothesis, fit
 from lsvision.stages.calibration.departures import KINDS, Placement, ReducedCorners, corner_rows
@@ -132,7 +140,7 @@ class _Search:
         for i in range(len(self.along_scan)):
             one, given = self.problem.at((i,)), self.linearised(i, here, hypothesis)
             white = torch.linalg.solve_triangular(one.noise_chol, given.columns[..., -1:], upper=False)[..., 0]
-            if not bool(suspicious(one, white / scale[i, :, None, None])):
+            if bool(by_chance(one, white / scale[i, :, None, None]) > SUSPICION):
                 continue
             errors = search(one, given, known)
             if errors is None:

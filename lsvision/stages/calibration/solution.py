@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from lsvision.estimation import Posterior
-from lsvision.stages.calibration.along_scan import Beforehand, ErrorsAlongScan, errors_along_scan, suspicious
+from lsvision.stages.calibration.along_scan import Beforehand, ErrorsAlongScan, by_chance, errors_along_scan
 from lsvision.stages.calibration.board_scale import explained_by_size, with_unknown_size
 from lsvision.stages.calibration.chosen import merged, scattered
 from lsvision.stages.calibration.config import CalibrationConfig
@@ -52,9 +52,10 @@ def estimate_with_noise(
     whitened = residuals_in_sigmas(problem, found.posterior.mean)
     # Residuals of a result that has not converged say nothing of the corners.
     settled = found.posterior.converged & math.isfinite(config.correlated_odds)
-    doubtful = settled & suspicious(problem, whitened / found.noise_scale.sqrt()[..., None, None, None])
+    probability = by_chance(problem, whitened / found.noise_scale.sqrt()[..., None, None, None])
+    probability = torch.where(settled, probability, 1.0)
     known = Beforehand(config.process_sigma or 0.0, config.correlated_odds)
-    along = errors_along_scan(problem, found.posterior.mean, doubtful, config.prior_sigma, known)
+    along = errors_along_scan(problem, found.posterior.mean, probability, config.prior_sigma, known)
     if bool(along.found.any()):
         again = estimate_white(along.problem(problem), start[along.found], config)
         found = found.replaced(along.found, again)

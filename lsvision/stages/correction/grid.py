@@ -71,8 +71,10 @@ def _check_extent(scan: Scan, length_mm: float, width_mm: float, pitch_mm: float
     scan_mm = scan.lines * scan.travel.line_pitch_mm + scan.rig.width_px * object_pitch_mm(scan.rig)
     if not max(length_mm, width_mm) <= _MOST_EXTENT * scan_mm:  # nor NaN
         problem = f"of a travel and field of {scan_mm:.4g} mm: do calibration and height_range_mm fit the scan?"
-    elif not length_mm * width_mm / pitch_mm**2 <= _MOST_CELLS * scan.lines * scan.rig.width_px:
+    elif not length_mm * width_mm <= _MOST_CELLS * scan.lines * scan.rig.width_px * pitch_mm * pitch_mm:  # nor x / 0
         problem = f"more than {_MOST_CELLS} cells of {pitch_mm:g} mm for each pixel: is the pitch right?"
+    elif not pitch_mm <= scan_mm:
+        problem = f"less than a cell of {pitch_mm:g} mm: is the pitch right?"
     else:
         return
     raise FileFormatError(scan.path, f"its product would be {length_mm:.4g} x {width_mm:.4g} mm large, {problem}")

@@ -24,11 +24,12 @@ from lsvision.stages.line_motion.register import Registered
 from lsvision.types import LINE_COMPONENTS, LineFinding, LineMotion
 
 _LEAST_LINES = 64  # measured; fewer do not tell a motion from errors
-_FIT_SAMPLES, _FIT_SEQUENCES = 256, 8  # that the likelihood is taken of
+_FIT_SAMPLES, _FIT_SEQUENCES = 256, 4  # that the likelihood is taken of
 _USUAL_STATES, _OTHER_STATES = 2, (1, 3)
 _USUAL_LENGTH = 60.0  # lines
 _SPREADS = {"sigma": 2.5, "length": 1.5, "noise_scale": 0.7, "memory": 0.7}  # of the logarithms beforehand
 _NOTHING = 1e-3  # of the errors of a line: a component that is not there
+_OBSERVED = 2.0  # errors of a line over what a component usually amounts to, at most
 _SPIKE_SIGMA, _SPIKE_LINES = 8.0, 9
 
 
@@ -54,8 +55,11 @@ def estimate(
     """
     data = _noisy_values(lines, usual_samples, config)
     count = len(data.values)
-    if int(data.valid.sum()) < max(_LEAST_LINES, config.min_share * count):
-        return not_measured(count, f"{int(data.valid.sum())} of {count} lines show the profile")
+    needed = max(_LEAST_LINES, math.ceil(config.min_share * count))
+    if int(data.valid.sum()) < needed:
+        return not_measured(
+            count, f"only {int(data.valid.sum())} of {count} lines show the profile, {needed} are needed"
+        )
     fit = _Fit.of(data, LineErrors.of(lines, data, common_mm), config)
     mean, covariance = smooth_signals(fit.parameters.model(), data, block=config.block_lines, halo=config.halo_lines)
     mean = without_trend(along_mm)(mean.T).T
@@ -91,22 +95,22 @@ class _Fit:
     @classmethod
     def of(cls, data: NoisyValues, errors: LineErrors, config: LineMotionConfig) -> "_Fit":
         """Fit the processes to lines with known errors."""
-        stride, sequences = _thinned(data)
+        stride, sequences = _thinned(data, errors)
         spread = (data.values[data.valid].square().mean(0) - errors.rms.square()).clamp(min=0).sqrt()
         expected = _expected(config)
         usual = SignalParameters(
             _USUAL_STATES, expected, torch.full_like(expected, _USUAL_LENGTH), errors.scale, errors.memory
-        ).thinned(stride)
+        ).thinned(float(stride))
         log_prior, signals = _Prior(usual), len(expected)
         free = torch.cat([torch.ones(2 * signals), torch.zeros(2 * signals)]).to(expected)
         start = replace(usual, sigma=spread.maximum(expected / 2))
-        fit = fit_signals(start, sequences, log_prior, free, iterations=10)
+        fit = fit_signals(start, sequences, log_prior, free, iterations=8)
         for states in _OTHER_STATES:
             other = fit_signals(replace(fit.parameters, states=states), sequences, log_prior, free, iterations=3)
             fit = other if other.log_density > fit.log_density else fit
         evidence = [
-            fit.log_density - _without(fit, i, errors.rms, sequences, log_prior)
-            if fit.parameters.sigma[i] > config.least_ratio * errors.rms[i]
+            fit.log_density - _without(fit, i, errors.rms, start.sigma, sequences, log_prior)
+            if fit.parameters.sigma[i] > config.least_ratio * errors.rms[i] and _is_observed(errors.rms, i, config)
             else 0.0
             for i in range(signals)
         ]
@@ -118,12 +122,11 @@ class _Fit:
         """What is known about a component, from its smoothed values."""
         name, sigma = LINE_COMPONENTS[index], float(self.parameters.sigma[index])
         noise, rms = float(self.noise[index]), float(_rms(mean))
-        expected = float(_expected(config)[index])
+        if not _is_observed(self.noise, index, config):
+            return LineFinding(name, "not observed", sigma=noise)
         if sigma > config.least_ratio * noise and self.evidence[index] > config.evidence:
             length = float(self.parameters.length[index]) * pitch_mm
             return LineFinding(name, "corrected", rms, float(variance.mean().sqrt()), length, self.evidence[index])
-        if noise > expected:
-            return LineFinding(name, "not observed", sigma=noise, evidence=self.evidence[index])
         return LineFinding(name, "absent", sigma=noise, evidence=self.evidence[index])
 
 
@@ -142,13 +145,20 @@ class _Prior:
         return total
 
 
-def _without(fit: SignalFit, index: int, noise: Tensor, sequences: NoisyValues, log_prior: _Prior) -> float:
-    """Logarithm of the density where one component is not there and its noise explains as much as it can."""
-    sigma = fit.parameters.sigma.clone()
+def _without(
+    fit: SignalFit, index: int, noise: Tensor, large: Tensor, sequences: NoisyValues, log_prior: _Prior
+) -> float:
+    """Logarithm of the density where one component is not there, and its noise and the others explain what they can.
+
+    Args:
+        noise: of a line. large: sigmas from which the others start.
+    """
+    sigma = large.maximum(fit.parameters.sigma)
     sigma[index] = _NOTHING * noise[index]
-    free = torch.zeros(4, len(noise), dtype=noise.dtype)
-    free[2:, index] = 1.0
-    found = fit_signals(replace(fit.parameters, sigma=sigma), sequences, log_prior, free.flatten(), iterations=4)
+    free = torch.ones(4, len(noise), dtype=noise.dtype)
+    free[2:] = 0.0
+    free[:, index] = free.new_tensor([0.0, 0.0, 1.0, 1.0])
+    found = fit_signals(replace(fit.parameters, sigma=sigma), sequences, log_prior, free.flatten(), iterations=6)
     # That the prior finds a sigma of nothing unlikely is no evidence.
     back = replace(found.parameters, sigma=fit.parameters.sigma)
     return found.log_density - float(log_prior(_as_batch(found.parameters)) - log_prior(_as_batch(back)))
@@ -160,17 +170,22 @@ def _expected(config: LineMotionConfig) -> Float[Tensor, "3"]:
     return torch.tensor([config.expected_x_mm, config.expected_z_mm, roll], dtype=torch.float64)
 
 
+def _is_observed(noise: Float[Tensor, "3"], index: int, config: LineMotionConfig) -> bool:
+    """Whether lines show a component to twice of what it usually amounts to."""
+    return bool(noise[index] <= _OBSERVED * _expected(config)[index])
+
+
 def _as_batch(parameters: SignalParameters) -> SignalParameters:
     return parameters.at(parameters.logarithms()[None])
 
 
-def _thinned(data: NoisyValues) -> tuple[int, NoisyValues]:
-    """Sequences from all over the lines for the likelihood, every so-manieth line: neighbours err alike."""
+def _thinned(data: NoisyValues, errors: LineErrors) -> tuple[int, NoisyValues]:
+    """Sequences from all over the lines for the likelihood: lines as far apart as their errors are remembered."""
     count = len(data.values)
-    stride = 4 if count > 4 * _LEAST_LINES else 1
-    span = _FIT_SAMPLES * stride
-    sequences = min(_FIT_SEQUENCES, -(-count // span))
-    starts = [i * max(count - span, 0) // max(sequences - 1, 1) for i in range(sequences)]
+    stride = max(1, min(int(errors.memory.min()), count // _LEAST_LINES))
+    sequences = min(_FIT_SEQUENCES, -(-count // (_FIT_SAMPLES * stride)))
+    span = min(_FIT_SAMPLES * stride, count // sequences)
+    starts = [i * (count - span) // max(sequences - 1, 1) for i in range(sequences)]
     return stride, data.at(torch.arange(0, span, stride)[:, None] + torch.tensor(starts))
 
 

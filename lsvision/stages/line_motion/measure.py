@@ -9,6 +9,7 @@ A profile that changes along the object, as a bent, twisted or corrugated rail's
 
 import math
 from collections.abc import Iterator
+from dataclasses import dataclass
 
 import torch
 
@@ -21,6 +22,7 @@ from lsvision.types import Depth, DepthSource, LineMotion, Motion, Scan
 
 _WINDOWS = 8  # of neighbouring lines, that the reference of a long scan comes from
 _APART = 4  # lines of a window; neighbours err alike
+_READ_LINES = 1024  # registered at once
 _ROUNDS = 3  # of aligning lines and making the reference of them
 _CROWN_SHARE = 0.95  # of the heights of a line: about its crown
 
@@ -35,44 +37,51 @@ def measure_line_motion(scan: Scan, depth: DepthSource, motion: Motion, config: 
         What is not there or cannot be seen is zero, and ``findings`` says so.
     """
     frame = ProductFrame(scan.rig, scan.travel, motion.n)
-    found = _reference(frame, depth, config)
-    if found is None:
+    shown = _shown(frame, depth, config)
+    if shown is None:
         return not_measured(depth.lines, "no profile that half of the lines show was measured")
-    reference, columns, samples = found
-    joined = Registered.joined(list(_registered(frame, depth, reference, columns, config)))
+    lines = Registered.joined(list(_registered(frame, depth, shown, config)))
     along = travel_at(scan.travel, torch.arange(depth.lines).double())
-    return estimate(joined, samples, along, depth_step_mm(scan.rig, config.common_error_px), config)
+    return estimate(lines, shown.samples, along, depth_step_mm(scan.rig, config.common_error_px), config)
 
 
-def _reference(
-    frame: ProductFrame, depth: DepthSource, config: LineMotionConfig
-) -> tuple[Reference, slice, int] | None:
+@dataclass(frozen=True)
+class _Shown:
     """The reference profile, the columns that show it, and how many samples of a line usually take part."""
-    samples = LineSamples.of(_spread_lines(depth, config.reference_lines), frame, config)
+
+    reference: Reference
+    columns: slice
+    samples: int
+
+
+def _shown(frame: ProductFrame, depth: DepthSource, config: LineMotionConfig) -> _Shown | None:
+    """What lines from all over the scan have in common; None where they have nothing."""
+    spread = _spread_lines(depth, config.reference_lines)
+    samples = LineSamples.of(spread, frame, config.height_range_mm, slice(None))
     values = samples.z.new_zeros(len(samples.z), 3)
-    q_x, height = placed(samples, values, frame)
-    crown = height.nanquantile(_CROWN_SHARE, dim=1).nan_to_num()
+    crown = placed(samples, values, frame)[1].nanquantile(_CROWN_SHARE, dim=1).nan_to_num()
     values[:, 1] = crown - crown.median()
+    shown = None
     for _ in range(_ROUNDS):
         q_x, height = placed(samples, values, frame)
         reference = reference_profile(q_x, height, object_pitch_mm(frame.rig), config.profile_depth_mm)
         if reference is None:
             return None
         columns = columns_of(reference, q_x, config.samples)
-        found = register(samples.on(columns), values, reference, frame, config.iterations, config.cut_sigma)
+        found = register(samples.on(columns), values, reference, frame, config)
         values = found.values - found.values.median(0).values
-    return reference, columns, int(found.samples.median())
+        shown = _Shown(reference, columns, int(found.samples.median()))
+    return shown
 
 
 def _registered(
-    frame: ProductFrame, depth: DepthSource, reference: Reference, columns: slice, config: LineMotionConfig
+    frame: ProductFrame, depth: DepthSource, shown: _Shown, config: LineMotionConfig
 ) -> Iterator[Registered]:
     """The lines of a scan, block by block."""
-    for start in range(0, depth.lines, config.block_lines):
-        block = depth.read(start, min(start + config.block_lines, depth.lines))
-        samples = LineSamples.of(block, frame, config).on(columns)
-        start_values = samples.z.new_zeros(len(samples.z), 3)
-        yield register(samples, start_values, reference, frame, config.iterations, config.cut_sigma)
+    for start in range(0, depth.lines, _READ_LINES):
+        block = depth.read(start, min(start + _READ_LINES, depth.lines))
+        samples = LineSamples.of(block, frame, config.height_range_mm, shown.columns)
+        yield register(samples, samples.z.new_zeros(len(samples.z), 3), shown.reference, frame, config)
 
 
 def _spread_lines(depth: DepthSource, count: int) -> Depth:

@@ -7,10 +7,10 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from lsvision.geometry import ProductFrame, depth_sigma, slope_at, zero_disparity_mm
-from lsvision.stages.line_motion.config import LineMotionConfig
 from lsvision.types import Depth
 
 _DISPARITY_SIGMA_PX = 0.09  # of a depth that comes without its own; the noise's true scale is estimated
+_STEEPEST = 2.5  # slope beyond which a place is left out: a matching window sees more than one height there
 _SLOPE_REACH_MM = 0.4  # to either side of a place, over which the slope of a profile is taken
 
 
@@ -27,15 +27,17 @@ class LineSamples:
     columns: Int[Tensor, " columns"]
 
     @classmethod
-    def of(cls, depth: Depth, frame: ProductFrame, config: LineMotionConfig) -> "LineSamples":
-        """All columns of some lines."""
-        z0, (low, high) = zero_disparity_mm(frame.rig), config.height_range_mm
-        z = depth.z.double()
+    def of(
+        cls, depth: Depth, frame: ProductFrame, height_range_mm: tuple[float, float], columns: slice
+    ) -> "LineSamples":
+        """Some columns of some lines."""
+        z0, (low, high) = zero_disparity_mm(frame.rig), height_range_mm
+        z = depth.z[:, columns].double()
         z = z.masked_fill(~((z >= z0 - high) & (z <= z0 - low)), torch.nan)
         given = depth.sigma
-        sigma = depth_sigma(frame.rig, z, _DISPARITY_SIGMA_PX) if given is None else given.double()
-        columns = torch.arange(z.shape[1])
-        return cls(z, sigma, slope_at(frame.rig, columns.double()), columns)
+        sigma = depth_sigma(frame.rig, z, _DISPARITY_SIGMA_PX) if given is None else given[:, columns].double()
+        numbers = torch.arange(depth.z.shape[1])[columns]
+        return cls(z, sigma, slope_at(frame.rig, numbers.double()), numbers)
 
     def on(self, columns: slice) -> "LineSamples":
         """Those of some columns."""
@@ -71,19 +73,33 @@ def reference_profile(
     measured = height.isfinite()
     if not bool(measured.any()):
         return None
-    origin = float(q_x[measured].min())
-    nodes = int((float(q_x[measured].max()) - origin) / step_mm) + 2
-    node = ((q_x[measured] - origin) / step_mm).round().long()
-    median, count = _median_by_node(node, height[measured], nodes)
-    common = median.masked_fill(count < len(q_x) / 2, torch.nan)
-    if not bool(common.isfinite().any()):
+    place, level = q_x[measured], height[measured]
+    origin = float(place.min())
+    position = (place - origin) / step_mm
+    node = position.round().long()
+    count = torch.bincount(node)
+    common = count >= len(q_x) / 2
+    if not bool(common.any()):
         return None
-    crown = float(common.nan_to_num(-torch.inf).max())
-    profile = common.masked_fill(~(common >= crown - depth_mm), torch.nan)
     reach = max(1, round(_SLOPE_REACH_MM / step_mm))
-    slope = torch.full_like(profile, torch.nan)
-    slope[reach:-reach] = (profile[2 * reach :] - profile[: -2 * reach]) / (2 * reach * step_mm)
-    return Reference(origin, step_mm, profile, slope)
+    first = _median_by_node(node, level).masked_fill(~common, torch.nan)
+    # Samples of a line at rest lie beside the nodes, always at the same places: the slope takes them there.
+    beside = torch.zeros_like(first).index_add_(0, node, position - node) / count.clamp(min=1)
+    slope = _slopes(first, torch.arange(len(first)) + beside, reach, step_mm)
+    moved = level - (slope.nan_to_num()[node] * (position - node)) * step_mm
+    profile = _median_by_node(node, moved).masked_fill(~common, torch.nan)
+    crown = float(profile.nan_to_num(-torch.inf).max())
+    profile = profile.masked_fill(~(profile >= crown - depth_mm), torch.nan)
+    slope = _slopes(profile, torch.arange(len(first)), reach, step_mm)
+    return Reference(origin, step_mm, profile, slope.masked_fill(slope.abs() > _STEEPEST, torch.nan))
+
+
+def _slopes(height: Tensor, position: Tensor, reach: int, step_mm: float) -> Tensor:
+    """Slopes of heights at positions, in steps, from those ``reach`` nodes to either side; NaN at the ends."""
+    slope = torch.full_like(height, torch.nan)
+    run = (position[2 * reach :] - position[: -2 * reach]) * step_mm
+    slope[reach : len(height) - reach] = (height[2 * reach :] - height[: -2 * reach]) / run
+    return slope
 
 
 def columns_of(reference: Reference, q_x: Float[Tensor, "lines columns"], most: int) -> slice:
@@ -95,10 +111,10 @@ def columns_of(reference: Reference, q_x: Float[Tensor, "lines columns"], most: 
     return slice(first, end, -(-(end - first) // most))
 
 
-def _median_by_node(node: Tensor, values: Tensor, nodes: int) -> tuple[Tensor, Tensor]:
-    """Median of the values of every node, and their number."""
+def _median_by_node(node: Int[Tensor, " values"], values: Float[Tensor, " values"]) -> Float[Tensor, " nodes"]:
+    """Median of the values of every node from 0 on."""
     order = values.argsort()
     order = order[node[order].argsort(stable=True)]
-    count = torch.bincount(node, minlength=nodes)
+    count = torch.bincount(node)
     middle = count.cumsum(0) - count + count // 2
-    return values[order][middle.clamp(max=len(values) - 1)], count
+    return values[order][middle.clamp(max=len(values) - 1)]

@@ -17,6 +17,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from lsvision.geometry import ProductFrame, line_axes, middle_point
+from lsvision.stages.line_motion.config import LineMotionConfig
 from lsvision.stages.line_motion.profiles import LineSamples, Reference
 
 # Standard deviations of displacements that no data restrict: mm, mm, rad. They keep the equations solvable.
@@ -63,8 +64,7 @@ def register(
     start: Float[Tensor, "lines 3"],
     reference: Reference,
     frame: ProductFrame,
-    iterations: int,
-    cut_sigma: float,
+    config: LineMotionConfig,
 ) -> Registered:
     """Register lines to a reference profile.
 
@@ -75,16 +75,16 @@ def register(
     rise = (height - reference.at(q_x)[0]).nanmedian(dim=1).values.nan_to_num()
     values = start - rise[:, None] * start.new_tensor([0.0, 1.0, 0.0])
     loose = torch.diag(values.new_tensor(_LOOSE) ** -2)
-    for step in range(iterations + len(_COARSE_MM)):
+    for step in range(config.iterations + len(_COARSE_MM)):
         equations = _equations(samples, values, reference, frame)
-        cut = _COARSE_MM[step] if step < len(_COARSE_MM) else cut_sigma * equations.sigma
+        cut = _COARSE_MM[step] if step < len(_COARSE_MM) else config.cut_sigma * equations.sigma
         information, slope, used = equations.weighted(cut)
         values = values - torch.linalg.solve(information + loose, slope)
     equations = _equations(samples, values, reference, frame)
     difference, variance = torch.zeros_like(values), torch.zeros_like(values)
     half = (samples.columns - samples.columns[0]) // _PIECE_PX % 2
     for side, sign in ((0, 1.0), (1, -1.0)):
-        part, slope, _ = equations.weighted(cut_sigma * equations.sigma, half == side)
+        part, slope, _ = equations.weighted(config.cut_sigma * equations.sigma, half == side)
         covariance = torch.linalg.inv(part + loose)
         difference = difference - sign * (covariance @ slope[..., None])[..., 0]
         variance = variance + covariance.diagonal(dim1=-2, dim2=-1)

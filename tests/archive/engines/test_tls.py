@@ -40,6 +40,25 @@ def test_certificates_are_three_files():
         build(EngineConfig, {**given, "tls_key": None}, option_fault, "engine")
 
 
+@pytest.mark.parametrize("address", ["garbage", "http://a:1", "ucx://a:1", "tcp://a", "tcp://a b:1", "tcp://a:123456"])
+def test_what_is_no_address_of_a_scheduler(address):
+    with pytest.raises(ConfigError, match=r"engine.scheduler: expected an address as tcp://host:8786, got"):
+        build(EngineConfig, {"scheduler": address}, option_fault, "engine")
+
+
+@pytest.mark.parametrize("address", ["tcp://a.b-c:8786", "127.0.0.1:1", "tcp://[::1]:8786"])
+def test_addresses_of_schedulers(address):
+    assert build(EngineConfig, {"scheduler": address}, option_fault, "engine").scheduler == address
+
+
+def test_certificates_and_tls_belong_together():
+    files = {"tls_authority": "a", "tls_certificate": "c", "tls_key": "k"}
+    assert build(EngineConfig, {**files, "scheduler": "tls://a:1"}, option_fault, "engine").tls is not None
+    for given in ({"scheduler": "tls://a:1"}, {**files, "scheduler": "tcp://a:1"}):
+        with pytest.raises(ConfigError, match=r"engine.scheduler: a scheduler at tls:// asks for certificates"):
+            build(EngineConfig, given, option_fault, "engine")
+
+
 def test_a_certificate_that_is_not_there_is_one_line(tmp_path):
     from lsvision.archive.engines.dask import DaskEngine
 

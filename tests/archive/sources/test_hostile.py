@@ -206,3 +206,10 @@ def test_a_zip_that_no_disk_holds(zipped, tmp_path, monkeypatch):
     with pytest.raises(ConfigError, match=r"archive: its copies take 0.0 GB, .* has room for 0.0 GB"):
         local_archive(url, tmp_path / "copies")
     assert not (tmp_path / "copies").exists()
+
+
+def test_a_name_that_no_file_can_have_is_one_line(tmp_path, calibration):
+    scan = make_scan(tmp_path / "a", 40)
+    (scan / "scan.yaml").write_text((scan / "scan.yaml").read_text().replace("left.tif", '"left\\0.tif"'))
+    with pytest.raises(FileFormatError, match="left: no such file or folder"):
+        plan_one(scan, calibration, PROCESSING)

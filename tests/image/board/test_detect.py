@@ -239,3 +239,8 @@ def true_corners(scan, board: Board) -> tuple[Tensor, Tensor]:
     line = line_at(scan.travel, y)
     left, right = project(scan.rig, x, z)
     return torch.stack([left, line], -1), torch.stack([right, line], -1)
+
+
+@pytest.mark.parametrize("size", [(2, 2), (2, 9), (3, 9), (9, 3)])
+def test_boards_too_narrow_for_opencv_are_looked_for_as_well(size):
+    assert detect_board(TensorImage(torch.randint(0, 255, (300, 300, 1)).to(torch.uint8)), Board(*size, 30.0)) is None

@@ -181,3 +181,9 @@ def test_nothing_is_taken_from_the_lines_of_a_halt_or_a_way_back(tmp_path: Path)
     assert used.sum() == pytest.approx((repaired[-1] - repaired[0]) / step, abs=1)
     assert np.abs(repaired - true)[:-1][used].max() < step + 1e-6
     assert np.abs(repaired - true)[1:][used].max() < step + 1e-6
+
+
+def test_a_line_number_beyond_all_numbers(tmp_path):
+    (tmp_path / "e.csv").write_text(f"line,position_mm\n0,0\n{'9' * 400},1\n")
+    with pytest.raises(FileFormatError, match="row 3: expected a line number and a finite position"):
+        read_encoder(tmp_path / "e.csv", 2, line_pitch_mm=1.0)

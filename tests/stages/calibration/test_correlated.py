@@ -8,7 +8,7 @@ import torch
 
 from lsvision.estimation import mean_chi_square_band, nees, upper_root
 from lsvision.estimation.gaussian_process import covariance_root
-from lsvision.stages.calibration.along_scan import Linearised, suspicious, with_processes
+from lsvision.stages.calibration.along_scan import SUSPICION, Linearised, by_chance, with_processes
 from lsvision.stages.calibration.along_scan.evidence import NormalEquations
 from lsvision.stages.calibration.along_scan.kernels import INTERVALS, KNOTS, kernel_family, wave_length
 from lsvision.stages.calibration.along_scan.lines import Travel, directions
@@ -17,6 +17,7 @@ from lsvision.stages.calibration.config import CalibrationConfig
 from lsvision.stages.calibration.linearise import linearise, point_factor
 from lsvision.stages.calibration.methods import joint
 from lsvision.stages.calibration.model import residuals_in_sigmas, whitened_residuals
+from lsvision.stages.calibration.verdict import UNLIKE
 from tests.stages.calibration.boards import RIG, Corners, simulate
 
 ROUGH, SMOOTH, WAVE = 1, 4, 13  # of the kernel family
@@ -171,7 +172,7 @@ def test_a_suspicion_falls_on_few_sound_sets_and_on_all_shaken_ones():
     for measured, share in ((corners, (0.0, 0.03)), (shaken(corners, 0.03, 233.0), (0.99, 1.0))):
         problem, start = measured.problem()
         posterior = joint(problem, start, CalibrationConfig())
-        suspected = suspicious(problem, residuals_in_sigmas(problem, posterior.mean)).double().mean()
+        suspected = (by_chance(problem, residuals_in_sigmas(problem, posterior.mean)) < SUSPICION).double().mean()
         assert share[0] <= suspected <= share[1]
 
 
@@ -234,6 +235,72 @@ def test_what_was_allowed_for_is_said():
     assert error.in_words.startswith("errors along the scan: 0.0")
     assert " mm rms sideways, about 1" in error.in_words
     assert calibrate(simulate().boards(), RIG, CalibrationConfig()).errors_along_scan == ()
+
+
+def rolled(corners: Corners, rms_mm: float, wavelength_mm: float) -> Corners:
+    """The same corners, all of one line turned together about the travel, by an axis half a metre below the board."""
+    points, travel = corners.points.clone(), corners.points[..., 1]
+    lever = corners.points[..., 0] - corners.points[..., 0].mean()
+    phase = 2 * math.pi * torch.rand(*travel.shape[:-1], 1, dtype=torch.float64)
+    angle = (
+        math.sqrt(2) * torch.sin(2 * math.pi * travel / wavelength_mm + phase) * rms_mm / lever.square().mean().sqrt()
+    )
+    points[..., 0] -= angle * (corners.points[..., 2].mean() + 500.0 - corners.points[..., 2])
+    points[..., 2] -= angle * lever
+    return dataclasses.replace(corners, points=points)
+
+
+def turned_about_the_view(corners: Corners, rms_rad: float, wavelength_mm: float) -> Corners:
+    """The same corners, each line's travel wrong in proportion to the place across it, which no component describes."""
+    points, travel = corners.points.clone(), corners.points[..., 1]
+    phase = 2 * math.pi * torch.rand(*travel.shape[:-1], 1, dtype=torch.float64)
+    angle = rms_rad * math.sqrt(2) * torch.sin(2 * math.pi * travel / wavelength_mm + phase)
+    points[..., 1] += angle * (points[..., 0] - points[..., 0].mean(-1, keepdim=True))
+    return dataclasses.replace(corners, points=points)
+
+
+def rough(corners: Corners, rms_mm: float, length_mm: float, components=(SIDEWAYS, DEPTH)) -> Corners:
+    """The same corners, all of one line displaced together: by a process whose correlation falls exponentially."""
+    points, travel = corners.points.clone(), corners.points[..., 1]
+    distance = (travel[..., :, None] - travel[..., None, :]).abs()
+    root = torch.linalg.cholesky(torch.exp(-distance / length_mm) + 1e-9 * torch.eye(travel.shape[-1]).double())
+    for component in components:
+        points[..., component] += rms_mm * (root @ torch.randn(*travel.shape, 1, dtype=torch.float64))[..., 0]
+    return dataclasses.replace(corners, points=points)
+
+
+def test_a_turn_about_the_travel_is_found_as_one():
+    torch.manual_seed(10)
+    corners = rolled(simulate(), 0.05, 150.0)
+    result = calibrate(corners.boards(), RIG, CalibrationConfig())
+    assert result.verdict == "determined"
+    (roll,) = (error for error in result.errors_along_scan if error.component == "roll")
+    assert roll.rms_mm == pytest.approx(0.05, rel=0.5)
+    assert "by a turn about the travel" in roll.in_words
+    assert nees(result.motion.n - corners.n, torch.linalg.cholesky(result.motion.covariance)) < 16.3
+
+
+def test_errors_that_no_component_describes_are_a_contradiction():
+    torch.manual_seed(11)
+    result = calibrate(turned_about_the_view(simulate(), 3e-4, 150.0).boards(), RIG, CalibrationConfig())
+    assert result.verdict == "inconsistent"
+    assert UNLIKE in result.reasons
+
+
+@pytest.mark.slow
+def test_errors_that_are_modelled_are_rarely_said_to_be_unlike_any():
+    torch.manual_seed(12)
+    sets = simulate(batch=(20,))
+    for corners in (shaken(sets, 0.03, 150.0), rough(sets, 0.05, 60.0)):
+        assert solved(corners).along_scan_unlike.sum() <= 1
+    assert solved(turned_about_the_view(sets, 3e-4, 150.0)).along_scan_unlike.double().mean() > 0.9
+
+
+@pytest.mark.slow
+def test_normalised_errors_under_a_correlation_of_60_mm_keep_their_band():
+    torch.manual_seed(13)
+    corners = rough(simulate(batch=(200,)), 0.03, 60.0)
+    assert 2.5 < errors(corners, solved(corners)).mean() < 3.6
 
 
 @pytest.mark.slow

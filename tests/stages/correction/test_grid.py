@@ -73,6 +73,8 @@ def test_stretch_is_no_skew():
         ((0.0, 1.0, 1e9), {}, "of a travel and field of"),
         ((1e300, 1.0, 0.0), {}, "of a travel and field of"),
         ((0.0, 1.0, 0.0), {"height_range_mm": (-1e6, 60.0)}, "of a travel and field of"),
+        ((0.0, 1.0, 0.0), {"pitch_mm": 1e-300}, "more than 1000 cells of 1e-300 mm for each pixel: is the pitch right"),
+        ((0.0, 1.0, 0.0), {"pitch_mm": 1e300}, "less than a cell of 1e[+]300 mm: is the pitch right"),
         ((0.0, 1.0, 0.0), {"pitch_mm": 1e-4}, "more than 1000 cells of 0.0001 mm for each pixel: is the pitch right"),
     ],
 )

@@ -1,10 +1,10 @@
 """Errors that all corners of a line share, as of vibration or of the encoder: found, weighed in the estimate, reported.
 
-The rest of the stage knows them by ``suspicious`` (whether to look), ``errors_along_scan`` (a batch of problems, with
+The rest of the stage knows them by ``by_chance`` (whether to look), ``errors_along_scan`` (a batch of problems, with
 the noise that the errors make), and ``search``, ``Linearised``, ``latents`` (one problem, beside other hypotheses).
 """
 
-from lsvision.stages.calibration.along_scan.check import can_be, suspicious
+from lsvision.stages.calibration.along_scan.check import SUSPICION, by_chance
 from lsvision.stages.calibration.along_scan.errors import ErrorsAlongScan, errors_along_scan, with_processes
 from lsvision.stages.calibration.along_scan.evidence import Linearised
 from lsvision.stages.calibration.along_scan.lines import COMPONENTS, latents
@@ -12,14 +12,14 @@ from lsvision.stages.calibration.along_scan.search import Beforehand, FoundError
 
 __all__ = [
     "COMPONENTS",
+    "SUSPICION",
     "Beforehand",
     "ErrorsAlongScan",
     "FoundErrors",
     "Linearised",
-    "can_be",
+    "by_chance",
     "errors_along_scan",
     "latents",
     "search",
-    "suspicious",
     "with_processes",
 ]

@@ -6,7 +6,7 @@ that no component of ``lines`` describes would leave waves along the travel.
 """
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from lsvision.estimation import chi_square_tail
@@ -14,34 +14,36 @@ from lsvision.stages.calibration.along_scan.evidence import Linearised
 from lsvision.stages.calibration.along_scan.lines import COMPONENTS, Travel, directions, half_waves, latents
 from lsvision.stages.calibration.problem import BoardProblem
 
-# Residuals are called correlated where chance alone would correlate them as much with less than this probability.
-_SUSPICION = 0.002
+SUSPICION = 0.002  # probability of residuals below which they are called correlated
 _ORDERS = 10  # of half-waves over the travel, that the residuals are tested for
 _IMPROBABLE = 1e-3  # probability of processes as large as those of a board, below which they are not what was modelled
 
 
-def suspicious(problem: BoardProblem, whitened: Float[Tensor, "*batch boards corners 3"]) -> Bool[Tensor, "*batch"]:
-    """Whether residuals are correlated along the travel more than chance allows.
+def by_chance(problem: BoardProblem, whitened: Float[Tensor, "*batch boards corners 3"]) -> Float[Tensor, "*batch"]:
+    """Probability, at most, that residuals are as much correlated along the travel by chance.
 
-    They are projected on half-waves over each board's travel. Of white residuals the squares, over all boards, are
-    chi-square variables, and what the fit of poses and n takes makes them smaller.
+    They are projected on half-waves over each board's travel, in every component, and in a travel that is wrong in
+    proportion to the place across the line, which no component describes. Of white residuals the squares, over all
+    boards, are chi-square variables, and what the fit of poses and n takes makes them smaller.
 
     Args:
         whitened: residuals of the corners in sigmas, zero where ``valid`` is false.
     """
     roll = directions(problem)[..., COMPONENTS.index("roll"), :]
-    along = torch.cat([whitened, (roll * whitened).sum(-1, keepdim=True)], dim=-1)
-    weight = torch.cat([torch.ones_like(whitened), roll.square().sum(-1, keepdim=True)], dim=-1)
+    turned = roll[..., 2] * whitened[..., 1]
+    along = torch.cat([whitened, torch.stack([(roll * whitened).sum(-1), turned], dim=-1)], dim=-1)
+    levers = torch.stack([roll.square().sum(-1), roll[..., 2].square()], dim=-1)
+    weight = torch.cat([torch.ones_like(whitened), levers], dim=-1)
     by_order = []
     for half_wave in half_waves(Travel.of(problem).place(problem), _ORDERS):
         wave = torch.where(problem.valid, half_wave, 0.0)[..., None]
         squares = (wave * along).sum(-2).square()
-        by_order.append((squares / (wave.square() * weight).sum(-2).clamp(min=1.0)).sum(-2))
+        by_order.append((squares / (wave.square() * weight).sum(-2).clamp(min=1e-6)).sum(-2))
     by_wave = torch.stack(by_order, dim=-1)
     single = chi_square_tail(by_wave, float(problem.boards))
     together = chi_square_tail(by_wave[..., :3, :].sum(-1), float(problem.boards * (_ORDERS + 1)))
     tests = torch.cat([single.flatten(-2), together], dim=-1)
-    return tests.amin(-1) * tests.shape[-1] < _SUSPICION
+    return tests.amin(-1) * tests.shape[-1]
 
 
 def can_be(problem: BoardProblem, linearised: Linearised, roots: Float[Tensor, "_ 4 knots columns"]) -> bool:
@@ -62,7 +64,7 @@ def can_be(problem: BoardProblem, linearised: Linearised, roots: Float[Tensor, "
     freedom = 3.0 * problem.valid.sum() - (1.0 - sigma**-2).sum()
     scale = (rest.square().sum() / freedom).clamp(min=1.0)
     probable = bool(by_board.amin() * boards > _IMPROBABLE)
-    return probable and not bool(suspicious(problem, rest / scale.sqrt()))
+    return probable and bool(by_chance(problem, rest / scale.sqrt()) > SUSPICION)
 
 
 def _error_of_fit(rows: Tensor, prior: Tensor) -> Tensor:

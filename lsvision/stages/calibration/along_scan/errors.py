@@ -7,13 +7,16 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from lsvision.estimation.gaussian_process import covariance_root
-from lsvision.stages.calibration.along_scan.check import can_be
+from lsvision.stages.calibration.along_scan.check import SUSPICION, can_be
 from lsvision.stages.calibration.along_scan.evidence import Linearised
 from lsvision.stages.calibration.along_scan.kernels import wave_length
 from lsvision.stages.calibration.along_scan.lines import COMPONENTS, Travel, latents
 from lsvision.stages.calibration.along_scan.search import Beforehand, search
 from lsvision.stages.calibration.problem import BoardProblem
 from lsvision.stages.calibration.reduction import CorrelatedNoise, affine_features, rows_with_latents
+
+# Probability of residuals below which they are no noise, though no errors along the scan were found.
+_BEYOND_DOUBT = 1e-4
 
 
 @dataclass(frozen=True)
@@ -39,7 +42,7 @@ class ErrorsAlongScan:
 def errors_along_scan(
     problem: BoardProblem,
     state: Float[Tensor, "*batch state"],
-    doubtful: Bool[Tensor, "*batch"],
+    probability: Float[Tensor, "*batch"],
     prior_sigma: float,
     known: Beforehand,
 ) -> ErrorsAlongScan:
@@ -50,10 +53,11 @@ def errors_along_scan(
 
     Args:
         state: of the problems with white noise.
-        doubtful: see ``suspicious``.
+        probability: of residuals as much correlated, see ``by_chance``.
         prior_sigma: of each component of n.
     """
     rms, length = (state.new_zeros(*state.shape[:-1], len(COMPONENTS)) for _ in range(2))
+    doubtful = probability < SUSPICION
     found, unlike = doubtful.clone(), torch.zeros_like(doubtful)
     if not bool(found.any()):
         return ErrorsAlongScan(found, unlike, rms, length, None)
@@ -65,6 +69,7 @@ def errors_along_scan(
         errors = search(one, linearised, known)
         if errors is None:
             found[place] = False
+            unlike[place] = (probability[place] < _BEYOND_DOUBT) & (known.process_sigma == 0)
             continue
         rms[place] = errors.rms_mm
         length[place] = wave_length(errors.covariance) * Travel.of(one).extent_mm

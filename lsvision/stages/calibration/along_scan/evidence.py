@@ -164,7 +164,7 @@ class NormalEquations:
         process, cross = conditional.matrix[:, :KNOTS, :KNOTS], conditional.matrix[:, :KNOTS, KNOTS:]
         state, log_det = conditional.matrix[:, KNOTS:, KNOTS:], conditional.log_det
         parts = []
-        for roots in (family.broad, family.waves):
+        for roots in family.roots:
             values, vectors = torch.linalg.eigh(roots.mT @ process[:, None] @ roots)
             across = (vectors.mT @ (roots.mT @ cross[:, None]))[:, :, None]
             signal = variances[:, None] * values.clamp(min=0.0)[:, :, None]

@@ -21,10 +21,11 @@ INTERVALS = KNOTS - 3  # over the travel; interpolation takes one more knot at e
 # are drifts, which a few boards hardly tell from shorter ones, and of which the mean over kernels would consist.
 _ROUGH_LENGTHS = (0.25, 0.5)
 _SMOOTH_LENGTHS = (0.0625, 0.125, 0.25, 0.5)
-# Waves per unit. Those nearer to each other than a quarter look alike on one unit, but for the longest.
-_FREQUENCIES = (0.25, 0.35, 0.5, *(0.25 * k for k in range(3, 17)))
-_COHERENCE = 2.0  # of waves: how far one keeps its phase
-_WAVE_RANK = 16  # of a wave's covariance, the rest of which is rounding
+# Waves per unit. Of those that soon lose their phase, neighbours nearer than a quarter look alike.
+_FADING_FREQUENCIES = (0.25, 0.35, 0.5, *(0.25 * k for k in range(3, 17)))
+_LASTING_FREQUENCIES = tuple(0.25 * 2.0 ** (k / 6) for k in range(25))
+_FADING, _LASTING = 2.0, 8.0  # coherence of waves: how far one keeps its phase
+_FADING_RANK, _LASTING_RANK = 16, 8  # of their covariances, the rest of which is rounding
 # Amplitudes, in units of the residuals' rms: prior log-uniform between them.
 AMPLITUDES = tuple(2.0**k for k in range(-5, 5))
 
@@ -33,41 +34,44 @@ AMPLITUDES = tuple(2.0**k for k in range(-5, 5))
 class KernelFamily:
     """Kernels of variance one at the knots, their roots, and the logarithm of their prior probabilities.
 
-    ``broad`` are the roots of the first kernels, ``waves`` those of the rest, which need fewer columns.
+    ``roots`` are those of some kernels after the other, in groups of as many columns.
     """
 
     covariance: Float[Tensor, "kernels knots knots"]
-    broad: Float[Tensor, "broad knots knots"]
-    waves: Float[Tensor, "waves knots rank"]
+    roots: tuple[Float[Tensor, "_ knots _"], ...]
     log_prior: Float[Tensor, " kernels"]
 
     def chosen(self, kept: Tensor) -> "KernelFamily":
         """The kernels of a mask, their prior as it was."""
-        first = len(self.broad)
-        return KernelFamily(
-            self.covariance[kept], self.broad[kept[:first]], self.waves[kept[first:]], self.log_prior[kept]
-        )
+        by_group = kept.split([len(group) for group in self.roots])
+        roots = tuple(group[some] for group, some in zip(self.roots, by_group, strict=True))
+        return KernelFamily(self.covariance[kept], roots, self.log_prior[kept])
 
     def to(self, like: Tensor) -> "KernelFamily":
         """The same in the dtype and on the device of a tensor."""
-        return KernelFamily(self.covariance.to(like), self.broad.to(like), self.waves.to(like), self.log_prior.to(like))
+        roots = tuple(group.to(like) for group in self.roots)
+        return KernelFamily(self.covariance.to(like), roots, self.log_prior.to(like))
 
 
 @cache
 def kernel_family() -> KernelFamily:
-    """All kernels; broad-band errors and waves are as probable, and so are all of each."""
+    """All kernels: broad-band errors and waves are as probable, and so are waves that fade and that last."""
     place = torch.arange(KNOTS, dtype=torch.float64) / INTERVALS
     distance = place[:, None] - place
-    broad = [exponential(distance / length) for length in _ROUGH_LENGTHS]
-    broad += [matern32(distance / length) for length in _SMOOTH_LENGTHS]
-    waves = [narrow_band(distance, 1.0 / frequency, _COHERENCE) for frequency in _FREQUENCIES]
-    covariance = torch.stack(broad + waves)
-    share = [0.5 / len(broad)] * len(broad) + [0.5 / len(waves)] * len(waves)
-    roots = covariance_root(covariance)
-    first = len(broad)
-    return KernelFamily(
-        covariance, roots[:first], roots[first:, :, -_WAVE_RANK:], torch.tensor(share, dtype=torch.float64).log()
+    rough = [exponential(distance / length) for length in _ROUGH_LENGTHS]
+    broad = rough + [matern32(distance / length) for length in _SMOOTH_LENGTHS]
+    fading = [narrow_band(distance, 1.0 / frequency, _FADING) for frequency in _FADING_FREQUENCIES]
+    lasting = [narrow_band(distance, 1.0 / frequency, _LASTING) for frequency in _LASTING_FREQUENCIES]
+    groups = [torch.stack(group) for group in (broad, fading, lasting)]
+    ranks = (KNOTS, _FADING_RANK, _LASTING_RANK)
+    roots = tuple(covariance_root(group)[..., -rank:] for group, rank in zip(groups, ranks, strict=True))
+    share = torch.cat(
+        [
+            group.new_full((len(group),), part / len(group))
+            for group, part in zip(groups, (0.5, 0.25, 0.25), strict=True)
+        ]
     )
+    return KernelFamily(torch.cat(groups), roots, share.log())
 
 
 def wave_length(covariance: Float[Tensor, "*batch knots knots"]) -> Float[Tensor, "*batch"]:

@@ -1,0 +1,145 @@
+"""Motion from line to line from a rail's profile: rendered depth with errors of a matcher's kind, and its truth."""
+
+import dataclasses
+import math
+from functools import cache
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+from torch.nn.functional import avg_pool2d
+
+from lsvision.geometry import scaled_rig, without_trend
+from lsvision.simulation import Acquisition, MotionConfig, SceneConfig, SensorConfig, Simulation, simulate
+from lsvision.stages.line_motion.config import LineMotionConfig
+from lsvision.stages.line_motion.measure import measure_line_motion
+from lsvision.types import DepthView, LineMotion, Motion, Scan, StoredDepth, TensorImage
+from tests.stages.rendered import BOARD, FULL_RIG
+
+RIG, PITCH, LINES = scaled_rig(FULL_RIG, 4), 0.28, 400
+STILL = MotionConfig(angle_x_deg=-1.5, angle_z_deg=0.8, stretch=1.0246)
+SHAKEN = dataclasses.replace(STILL, vibration_x_mm=0.65, vibration_z_mm=0.65, vibration_roll_deg=0.02)
+RAIL = SceneConfig(kind="rail")
+SIGMA_MM = 0.06
+CONFIG = LineMotionConfig(common_error_px=0.0, block_lines=200, halo_lines=60)
+
+
+@cache
+def rendered(motion: MotionConfig, scene: SceneConfig = RAIL) -> tuple[Simulation, Tensor]:
+    """A simulation and its true depth, with defects on the rail."""
+    source = simulate(RIG, BOARD, scene, motion, SensorConfig(supersampling=1), Acquisition(PITCH, lines=LINES))
+    return source, torch.cat(list(source.depth_strips()))
+
+
+def matched(depth: Tensor, seed: int = 0) -> Tensor:
+    """Depth with errors that neighbours share, as those of a matching window."""
+    generator = torch.Generator().manual_seed(seed)
+    white = torch.randn(1, len(depth) + 8, depth.shape[1] + 8, generator=generator)
+    return depth + SIGMA_MM * 9 * avg_pool2d(white, 9, 1)[0]
+
+
+def measure(depth: Tensor, config: LineMotionConfig = CONFIG) -> LineMotion:
+    source, _ = rendered(STILL)
+    image = TensorImage(torch.zeros(*depth.shape, 1, dtype=torch.uint8))
+    z = TensorImage(depth[..., None].float())
+    scan = Scan(Path("rail"), RIG, source.travel, DepthView(image, z))
+    stored = StoredDepth(z, TensorImage(torch.full_like(z.tensor, SIGMA_MM)))
+    motion = Motion(source.trajectory.n, torch.zeros(3, 3, dtype=torch.float64))
+    return measure_line_motion(scan, stored, motion, config)
+
+
+def true_values(source: Simulation, lines: int = LINES) -> Tensor:
+    """Vibration of lines without mean and trend."""
+    vibration = source.trajectory.vibration(torch.arange(lines).double())
+    return without_trend(torch.arange(lines).double())(vibration.T).T
+
+
+def states(motion: LineMotion) -> list[str]:
+    return [finding.state for finding in motion.findings]
+
+
+@pytest.mark.slow
+def test_a_shaken_rail_is_measured_as_well_as_its_sigma_says() -> None:
+    source, depth = rendered(SHAKEN)
+    found = measure(matched(depth))
+    error = found.values[:, :3] - true_values(source)
+    assert states(found)[:2] == ["corrected", "corrected"]
+    assert error[:, 0].square().mean().sqrt() < 0.06
+    assert error[:, 1].square().mean().sqrt() < 0.015
+    covariance = found.covariance[:, :2, :2]
+    nees = (error[:, None, :2] @ torch.linalg.solve(covariance, error[:, :2, None]))[:, 0, 0]
+    assert 0.8 < nees.mean() < 4.0
+    assert found.findings[1].rms == pytest.approx(float(true_values(source)[:, 1].square().mean().sqrt()), rel=0.1)
+    assert not found.values[:, 3].any()
+    torch.testing.assert_close(found.values[:, 1].mean(), torch.zeros(()).double(), rtol=0, atol=1e-9)
+
+
+@pytest.mark.slow
+def test_a_still_rail_keeps_every_bit() -> None:
+    found = measure(matched(rendered(STILL)[1], seed=1))
+    assert "corrected" not in states(found)
+    assert found.is_still
+    assert not found.covariance.any()
+
+
+@pytest.mark.slow
+def test_pits_scratches_and_holes_are_outliers() -> None:
+    source, depth = rendered(SHAKEN)
+    harmed = matched(depth)
+    rail = (depth < 790).float().mean(0).argmax()
+    harmed[100:140, rail - 20 : rail + 20] += 0.4
+    harmed[:, rail + 30 : rail + 40] += 0.3  # a scratch all along: part of the profile
+    harmed[200:205] = torch.nan
+    harmed[300:330, : rail + 20] = torch.nan
+    error = (measure(harmed).values[:, :2] - true_values(source)[:, :2]).abs()
+    assert error[:, 1].square().mean().sqrt() < 0.012
+    assert error[100:140, 1].max() < 0.04
+    assert error[:, 0].square().mean().sqrt() < 0.12
+
+
+@pytest.mark.slow
+def test_a_crown_alone_shows_neither_sideways_motion_nor_roll() -> None:
+    source, depth = rendered(SHAKEN)
+    middle = int((depth < 790).float().mean(0).argmax())
+    crown = torch.full_like(depth, torch.nan)
+    crown[:, middle - 30 : middle + 30] = matched(depth)[:, middle - 30 : middle + 30]
+    found = measure(crown)
+    assert states(found) == ["not observed", "corrected", "not observed"]
+    assert "the object's shape does not show it" in found.findings[0].in_words
+    assert (found.values[:, 1] - true_values(source)[:, 1]).square().mean().sqrt() < 0.04
+
+
+@pytest.mark.slow
+def test_a_knock_stays_a_knock() -> None:
+    depth = matched(rendered(STILL)[1])
+    depth[200:] += 2.0
+    found = measure(depth)
+    assert found.findings[1].state == "corrected"
+    before, after = found.values[185:195, 1].mean(), found.values[206:216, 1].mean()
+    assert float(after - before) == pytest.approx(2.0, abs=0.05)
+    assert float(found.values[202, 1] - found.values[197, 1]) == pytest.approx(2.0, abs=0.15)
+
+
+def test_what_cannot_be_measured_is_said_in_one_line() -> None:
+    depth = matched(rendered(SHAKEN)[1])
+    generator = torch.Generator().manual_seed(0)
+    cases = {
+        "no profile": torch.full_like(depth, torch.nan),
+        "no profile that": depth.masked_fill(torch.rand(depth.shape, generator=generator) < 0.9, torch.nan),
+        "only 10 of 10 lines show the profile, 64 are needed": depth[:10],
+        "only 1 of 1 lines": depth[:1],
+    }
+    for words, case in cases.items():
+        found = measure(case)
+        assert found.is_still
+        assert found.lines == len(case)
+        assert [finding.state for finding in found.findings] == 3 * ["not observed"]
+        assert words in found.findings[0].in_words
+
+
+@pytest.mark.slow
+def test_a_flat_plane_shows_depth_and_roll_alone() -> None:
+    found = measure(matched(torch.full((300, RIG.width_px), 810.0)))
+    assert states(found) == ["not observed", "absent", "absent"]
+    assert found.findings[2].sigma < math.radians(0.01)
