@@ -24,7 +24,7 @@ from lsvision.geometry import zero_disparity_mm
 from lsvision.io import NewScan, read_product, write_calibration, write_scan
 from lsvision.stages.correction.config import CorrectionConfig
 from lsvision.stages.disparity.config import DisparityConfig
-from lsvision.types import Calibration, Motion, Observability, Rig, Travel
+from lsvision.types import LINE_COMPONENTS, Calibration, LineFinding, LineMotion, Motion, Observability, Rig, Travel
 
 WIDTH = 64
 RIG = Rig(WIDTH, 1120.0, 113.84, 354.0, 8.8, 54.0)
@@ -54,6 +54,22 @@ def make_scan(folder: Path, lines: int = 96, seed: int = 0, *, stereo: bool = Fa
         ),
     )
     return folder
+
+
+def shaken(lines: int = 96, *components: str) -> LineMotion:
+    """A motion of some components, or of all but dy, with what was found."""
+    components = components or ("dx", "dz", "roll")
+    random = torch.Generator().manual_seed(lines)
+    size = torch.tensor([0.3, 0.4, 2e-3, 0.2], dtype=torch.float64)
+    there = torch.tensor([name in components for name in LINE_COMPONENTS])
+    values = torch.randn(lines, 4, generator=random, dtype=torch.float64) * size * there
+    covariance = torch.diag((0.2 * size * there).square()).repeat(lines, 1, 1)
+    rms = values.square().mean(0).sqrt().tolist()
+    findings = tuple(
+        LineFinding(name, "corrected", rms[i], 0.2 * float(size[i])) if there[i] else LineFinding(name, "absent")
+        for i, name in enumerate(LINE_COMPONENTS)
+    )
+    return LineMotion(values, covariance, findings)
 
 
 def make_calibration(path: Path, n: Sequence[float] = (0.02, 1.02, -0.01), rig: Rig = RIG) -> Path:

@@ -17,13 +17,13 @@ import pytest
 
 from lsvision.archive import LEDGER_FILE, Ledger
 from lsvision.errors import LsvisionError
-from tests.archive.archives import assert_same_products, make_calibration, make_scan
+from tests.archive.archives import assert_same_products, make_calibration, make_scan, shaken
 
 pytestmark = pytest.mark.slow
 psutil = pytest.importorskip("psutil")
 
 MOMENTS = 10
-STRIPS = 6 * 13 + 12 * 14
+STRIPS = 6 * 13 + 12 + 12 * 14
 MOST_SECONDS = 300
 
 
@@ -31,7 +31,7 @@ MOST_SECONDS = 300
 def archive(tmp_path_factory) -> Path:
     root = tmp_path_factory.mktemp("archive")
     for number in range(12):
-        make_scan(root / f"s{number}", 400, number, stereo=number % 2 == 0)
+        make_scan(root / f"s{number}", 400, number, stereo=number % 2 == 0, line_motion=shaken(400))
     make_calibration(root / "calibration.json")
     return root
 
@@ -42,7 +42,7 @@ def start(archive: Path, output: Path, *options: str) -> subprocess.Popen:
             sys.executable, "-m", "lsvision.run", "+experiment=reprocess", f"archive={archive}",
             f"calibration={archive / 'calibration.json'}", f"output={output}", "engine.workers=2",
             "disparity.block_lines=32", "disparity.strip_lines=32", "disparity.halo_lines=8",
-            "correction.strip_rows=32", "line_motion=none",
+            "correction.strip_rows=32",
             f"hydra.run.dir={output.with_name(output.name + '-run')}", *options,
         ],
         stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True,

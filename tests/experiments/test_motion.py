@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 
 from lsvision.io import read_line_motion, read_product
-from tests.archive.archives import make_calibration, make_scan
-from tests.archive.test_line_motion import planes, shaken
+from tests.archive.archives import make_calibration, make_scan, shaken
+from tests.archive.test_line_motion import planes
 
 
 @pytest.fixture
