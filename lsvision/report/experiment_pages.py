@@ -130,7 +130,7 @@ def product_report(
             Headline("Heights", span, f"first {rows} rows"),
             *_motion_headlines(calibration),
         ],
-        tables=[findings_table(line_motion)] if line_motion.get("components") else [],
+        tables=[findings_table(line_motion, settings["registration"])] if line_motion.get("components") else [],
         figures=figures,
         settings=settings,
         provenance={key: str(product.metadata[key]) for key in _PROVENANCE if key in product.metadata},

@@ -35,7 +35,7 @@ def motion_report(measured: MeasuredMotion, settings: dict, folder: Path) -> Non
         title=f"Motion from line to line of {Path(measured.scan).name}",
         lead=". ".join(line.strip() for line in line_motion_words(measured.metadata)),
         headlines=[_headline(component) for component in components],
-        tables=[findings_table(measured.metadata)],
+        tables=[findings_table(measured.metadata, settings["registration"])],
         figures=[
             *line_motion_figures(measured.view),
             *([profiles_before_and_after(measured.before, measured.after)] if len(measured.before.q_x) > 1 else []),
@@ -46,12 +46,17 @@ def motion_report(measured: MeasuredMotion, settings: dict, folder: Path) -> Non
     write_report(page, folder)
 
 
-def findings_table(metadata: Mapping[str, Any]) -> Table:
-    """A row for every component: state, rms, sigma, length, gate, and what that means."""
+def findings_table(metadata: Mapping[str, Any], registration: Mapping[str, Any]) -> Table:
+    """A row for every component: state, rms, sigma, length, gate, and what that means.
+
+    Args:
+        registration: the options that it was measured with.
+    """
     header = ("component", "state", "rms", "sigma, rms", "changes over", "log evidence", "in words")
     note = (
-        "Log evidence is how much better the lines fit with the component than without; below the gate a component "
-        "counts as absent. A component that the object's shape does not show is not observed."
+        "Log evidence is how much better the lines fit with the component than without. One of which it is below "
+        f"{registration['evidence']:g}, or which is less than {registration['least_ratio']:g} times the errors of a "
+        "line, counts as absent. One that the object's shape does not show is not observed."
     )
     return Table("Components", header, [_row(item) for item in metadata.get("components", ())], note)
 

@@ -29,7 +29,7 @@ def test_all_that_it_writes(asked, command, tmp_path, capsys):
     assert summary["lines"] == 96
     assert summary["line_motion"]["corrected"] == ["dx", "dz", "roll"]
     page = (tmp_path / "run" / "report.html").read_text(encoding="utf-8")
-    assert "Log evidence" in page
+    assert "below 12, or which is less than 1 times the errors of a line" in page
     figures = {path.name for path in (tmp_path / "run" / "figures").glob("*.png")}
     assert figures == {"line_motion.png", "line_motion_spectrum.png", "line_motion_profile.png"}
     assert not list((tmp_path / "run").glob(".depth-*"))
