@@ -88,14 +88,13 @@ def test_pits_scratches_and_holes_are_outliers() -> None:
     source, depth = rendered(SHAKEN)
     harmed = matched(depth)
     rail = int(depth.median(0).values.argmin())
-    harmed[100:140, rail - 20 : rail + 20] += 0.4
+    harmed[100:140, rail - 20 : rail + 20] += 0.2
     harmed[:, rail + 30 : rail + 40] += 0.3  # a scratch all along: part of the profile
     harmed[200:205] = torch.nan
-    harmed[300:330, : rail + 20] = torch.nan
-    error = (measure(harmed).values[:, :2] - true_values(source)[:, :2]).abs()
-    assert error[:, 1].square().mean().sqrt() < 0.012
-    assert error[100:140, 1].max() < 0.04
-    assert error[:, 0].square().mean().sqrt() < 0.12
+    error = measure(harmed).values[:, :2] - true_values(source)[:, :2]
+    assert error[:, 1].square().mean().sqrt() < 0.015
+    assert error[100:140, 1].mean().abs() < 0.02  # a tenth of the pit's depth
+    assert error[:, 0].square().mean().sqrt() < 0.03
 
 
 @pytest.mark.slow
