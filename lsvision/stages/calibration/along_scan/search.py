@@ -48,18 +48,15 @@ class Beforehand:
 class FoundErrors:
     """Covariance of the errors of each component at the knots, mm², and the log evidence for it.
 
+    ``rms_mm`` of each component is the most probable one: a covariance that is a mean over amplitudes is larger.
     ``noise`` is that covariance and, by board, what a random walk of n explains. The constant that is missing in the
     evidence is the same for all linearisations of a problem.
     """
 
     covariance: Float[Tensor, "4 knots knots"]
     noise: Float[Tensor, "_ 4 knots knots"]
+    rms_mm: Float[Tensor, "4"]
     log_evidence: float
-
-    @property
-    def rms_mm(self) -> Float[Tensor, "4"]:
-        """Root-mean-square of each component."""
-        return self.covariance.diagonal(dim1=-2, dim2=-1).mean(-1).sqrt()
 
 
 def search(problem: BoardProblem, linearised: Linearised, known: Beforehand) -> FoundErrors | None:
@@ -77,6 +74,7 @@ class _Search:
     equations: NormalEquations
     family: KernelFamily
     covariances: Float[Tensor, "4 processes knots knots"]
+    rms_mm: Float[Tensor, "4 processes"]  # geometric means
     by_kernel: Float[Tensor, "4 kernels"]  # log likelihood ratio to no error; that there is none has its part in it
     kept: Bool[Tensor, "4 kernels"]
     walk: Float[Tensor, "_ 4 knots knots"]  # covariance of what a walk of n explains, by board
@@ -95,6 +93,7 @@ class _Search:
             equations=NormalEquations.of(problem, linearised),
             family=family,
             covariances=like.new_zeros(_COUNT, _PROCESSES, KNOTS, KNOTS),
+            rms_mm=like.new_zeros(_COUNT, _PROCESSES),
             by_kernel=like.new_zeros(_COUNT, kernels),
             kept=torch.ones(_COUNT, kernels, dtype=torch.bool, device=like.device),
             walk=walk,
@@ -118,7 +117,8 @@ class _Search:
             self._weigh_first(component)
         covariance = self.covariances.sum(1)
         present, roots = self._present(covariance + self.walk)
-        return FoundErrors(covariance, covariance + self.walk, float(self.equations.log_evidence(present, roots)))
+        log_evidence = float(self.equations.log_evidence(present, roots))
+        return FoundErrors(covariance, covariance + self.walk, self.rms_mm.square().sum(-1).sqrt(), log_evidence)
 
     def _weigh_first(self, component: int) -> "_Weighed":
         """Weigh the first process of a component."""
@@ -136,10 +136,14 @@ class _Search:
         none = torch.logsumexp(log_prior, 0) + absent
         evidence = torch.logaddexp(torch.logsumexp(joint.flatten(), 0), none)
         weights = torch.exp(joint - evidence)
-        by_variance = (weights * self._variances(component)).sum(-1)
+        variances = self._variances(component)
+        probability = weights.sum().clamp(min=1e-300)
+        log_variance = (weights * variances.log()).sum() / probability
+        self.rms_mm[component, layer] = (probability * log_variance.exp()).sqrt()
+        by_variance = (weights * variances).sum(-1)
         self.covariances[component, layer] = torch.tensordot(by_variance, family.covariance, 1)
         by_kernel = torch.logsumexp(ratios, -1) + present
-        return _Weighed(torch.logaddexp(by_kernel, by_kernel.new_tensor(absent)), float(weights.sum()))
+        return _Weighed(torch.logaddexp(by_kernel, by_kernel.new_tensor(absent)), float(probability))
 
     def _log_ratios(self, component: int, layer: int, family: KernelFamily) -> Tensor:
         """Log likelihood ratios of a process of each kernel and amplitude to none, the others as they stand."""
