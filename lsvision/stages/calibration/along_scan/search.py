@@ -24,6 +24,7 @@ from lsvision.stages.calibration.problem import BoardProblem
 
 _COUNT = len(COMPONENTS)
 _SWEEPS = 2
+_SHOWN = 1.5  # size of errors at most, as it is reported, in units of the residuals' rms
 _PROCESSES = 2  # of a component, that add up
 _PRESENT = (0.2, 0.1)  # prior probabilities of a component's first process, and of its second where the first is there
 _THERE = 0.5  # probability of a process from which a further one is looked for
@@ -48,7 +49,8 @@ class Beforehand:
 class FoundErrors:
     """Covariance of the errors of each component at the knots, mm², and the log evidence for it.
 
-    ``rms_mm`` of each component is the most probable one: a covariance that is a mean over amplitudes is larger.
+    ``rms_mm`` of each component is the most probable one, and little more than the residuals show: a covariance that is
+    a mean over amplitudes is larger, above all that of waves of which most is taken for poses and n.
     ``noise`` is that covariance and, by board, what a random walk of n explains. The constant that is missing in the
     evidence is the same for all linearisations of a problem.
     """
@@ -115,7 +117,8 @@ class _Search:
         covariance = self.covariances.sum(1)
         present, roots = self._present(covariance + self.walk)
         log_evidence = float(self.equations.log_evidence(present, roots))
-        return FoundErrors(covariance, covariance + self.walk, self.rms_mm.square().sum(-1).sqrt(), log_evidence)
+        rms = torch.minimum(self.rms_mm.square().sum(-1).sqrt(), _SHOWN * self.equations.rms_mm)
+        return FoundErrors(covariance, covariance + self.walk, rms, log_evidence)
 
     def _weigh_first(self, component: int) -> "_Weighed":
         """Weigh the first process of a component."""
