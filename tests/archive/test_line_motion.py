@@ -17,6 +17,7 @@ from lsvision.experiments.correct import CorrectSettings, run_correct
 from lsvision.experiments.reprocess import ReprocessSettings, run_reprocess
 from lsvision.geometry import zero_disparity_mm
 from lsvision.io import NewScan, check_product, read_product, write_line_motion, write_scan
+from lsvision.simulation import Acquisition, MotionConfig, SceneConfig, SensorConfig, simulate
 from lsvision.stages.line_motion.config import LineMotionConfig
 from lsvision.stages.line_motion.estimate import not_measured
 from lsvision.types import LINE_COMPONENTS, LineFinding, LineMotion, Travel
@@ -27,9 +28,11 @@ from tests.archive.archives import (
     InProcess,
     assert_same_products,
     local,
+    make_calibration,
     make_scan,
     process,
 )
+from tests.stages.rendered import BOARD, SMALL_RIG
 
 AUTO = replace(PROCESSING, line_motion=LineMotionChoice("auto"))
 pytestmark = pytest.mark.usefixtures("quick_reports")
@@ -346,3 +349,50 @@ def test_units_stand_with_the_arrays(archive, calibration, tmp_path, measured):
     stated = json.loads((made.path / "line_motion" / "roll_sigma_rad" / "zarr.json").read_text())
     assert stated["attributes"] == {"unit": "radian"}
     assert stated["dimension_names"] == ["line"]
+
+
+@pytest.fixture(scope="module")
+def rail(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A shaken rail with a depth map, ``scans/rail``, and its ``n.json``."""
+    folder = tmp_path_factory.mktemp("rail")
+    shaken_in_depth = MotionConfig(angle_x_deg=-1.5, stretch=1.02, vibration_z_mm=0.5)
+    rendered = simulate(
+        SMALL_RIG, BOARD, SceneConfig(kind="rail"), shaken_in_depth, SensorConfig(supersampling=1),
+        Acquisition(1.12, lines=300),
+    )  # fmt: skip
+    depth = (strip[..., None] for strip in rendered.depth_strips())
+    scan = NewScan(rendered.rig, rendered.travel, rendered.strips("left"), None, rendered.lines, depth=depth)
+    write_scan(folder / "scans" / "rail", scan)
+    make_calibration(folder / "n.json", rendered.trajectory.n.tolist(), rendered.rig)
+    return folder
+
+
+@pytest.mark.slow
+def test_what_is_measured_is_the_same_anywhere(rail, tmp_path):
+    """On two threads of this process or one of another, in other strips; and the crown stands still."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(2)
+    try:
+        process(rail / "scans", rail / "n.json", tmp_path / "o", InProcess(1), AUTO)
+    finally:
+        torch.set_num_threads(threads)
+    other = replace(AUTO, correction=replace(AUTO.correction, strip_rows=32))
+    process(rail / "scans", rail / "n.json", tmp_path / "p", local(2), other)
+    assert_same_products(tmp_path / "o", tmp_path / "p")
+    one, two = (read_product(tmp_path / out / "rail.zarr") for out in "op")
+    assert one.metadata["line_motion"] == two.metadata["line_motion"]
+    assert "dz" in one.metadata["line_motion"]["corrected"]
+    process(rail / "scans", rail / "n.json", tmp_path / "q", InProcess(1))
+    before, after = (wander_of_crown(tmp_path / out / "rail.zarr") for out in "qo")
+    assert after < 0.03 < 0.3 < before
+
+
+def wander_of_crown(path: Path) -> float:
+    """Rms about a straight line of the height of a rail's crown along it, mm, away from the ends."""
+    product = read_product(path)
+    height = product.height(40, product.shape[0] - 40).double()
+    top = int(height.nanmedian(0).values.nan_to_num(-torch.inf).argmax())
+    crown = height[:, top - 3 : top + 4].nanmedian(1).values
+    row = torch.linspace(-1, 1, len(crown), dtype=torch.float64)
+    line = torch.stack([torch.ones_like(row), row], dim=1)
+    return float((crown - line @ torch.linalg.lstsq(line, crown[:, None]).solution[:, 0]).square().mean().sqrt())
