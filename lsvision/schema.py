@@ -1,9 +1,8 @@
 """The one checker of options and of the entries of files.
 
-A frozen dataclass states on each field what the field may hold: type, range, default. A ``Checked`` dataclass is
-checked wherever it is made; ``build`` makes any dataclass from plain data, as YAML, JSON and the command line give it,
-and names the entry at fault. A number is finite unless its annotation says otherwise; true and "3" are no numbers, 3 is
-a number, 3.0 is no whole number. A list stands for a tuple, an unknown key is an error.
+A frozen dataclass states on each field what it may hold: type, range, default. A ``Checked`` dataclass is checked
+wherever it is made; ``build`` makes any dataclass from plain data and names the entry at fault. A number is finite
+unless its annotation says otherwise; true and "3" are no numbers, 3.0 is no whole number, a list stands for a tuple.
 """
 
 import difflib
@@ -184,7 +183,7 @@ def build(schema: type[T], data: object, fault: Fault, where: str = "") -> T:
             raise fault(prefix + key, f"missing{f' (is {near[0]!r} meant for it?)' if near else ''}")
     for key in data:
         if key not in known:
-            raise fault(f"{prefix}{key}", f"unknown key; {_hint(str(key), known)}")
+            raise fault(f"{prefix}{key}", f"unknown key; {near_hint(str(key), known)}")
     try:
         return schema(**values)
     except OptionError as error:
@@ -245,6 +244,7 @@ def _either(choices: list[str]) -> str:
     return " or ".join([", ".join(choices[:-1]), choices[-1]] if len(choices) > 1 else choices)
 
 
-def _hint(unknown: str, known: Iterable[str]) -> str:
+def near_hint(unknown: str, known: Iterable[str]) -> str:
+    """What may have been meant by an unknown name."""
     near = difflib.get_close_matches(unknown, known, n=1)
     return f"did you mean {near[0]!r}?" if near else f"known keys: {', '.join(known)}"

@@ -6,6 +6,7 @@ from lsvision.archive.engines.local import LocalEngine
 from lsvision.archive.engines.protocol import Engine, EngineConfig, worker_count
 from lsvision.archive.job import WORK_FOLDER, Place
 from lsvision.archive.ledger import LEDGER_FILE, Ledger, ScanRow, StripRow, ledger_lines
+from lsvision.archive.line_motion import LineMotionChoice, measured_line_motion
 from lsvision.archive.lock import is_worked_on, sole_run
 from lsvision.archive.one_scan import FinishedProduct, plan_one, process_one
 from lsvision.archive.plan import Plan, plan_run, predicted_bytes, predicted_seconds
@@ -26,6 +27,7 @@ __all__ = [
     "Found",
     "InProcessEngine",
     "Ledger",
+    "LineMotionChoice",
     "LocalEngine",
     "Outcome",
     "Place",
@@ -41,6 +43,7 @@ __all__ = [
     "is_worked_on",
     "ledger_lines",
     "local_archive",
+    "measured_line_motion",
     "plan_one",
     "plan_run",
     "predicted_bytes",

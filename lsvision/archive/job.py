@@ -1,17 +1,18 @@
-"""The work on one scan: hash, match, correct, finish; each step only where its result is missing."""
+"""The work on one scan: hash, match, find the line motion, correct, finish; each step where its result is missing."""
 
 import shutil
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
-from functools import cached_property
+from dataclasses import dataclass, replace
 from pathlib import Path
 
-from lsvision import __version__
 from lsvision.archive.depth_store import create_depth_store, remove_partial_chunks
-from lsvision.archive.identity import depth_key, key_of, product_key
+from lsvision.archive.identity import key_of
 from lsvision.archive.ledger import Ledger, ScanRow, Stage, StripRow, measured_cells
+from lsvision.archive.line_motion import FindLineMotion, FoundLineMotion, StoredLineMotion
 from lsvision.archive.planned import PlannedScan, Processing
-from lsvision.archive.product import check_own, is_finished, product_layout, product_path
+from lsvision.archive.product import check_own, is_finished, product_layout
+from lsvision.archive.results import ScanResults
+from lsvision.archive.rows import finished_row, running_row
 from lsvision.archive.tasks import Outcome, Strip, Task
 from lsvision.archive.work import (
     CorrectionInput,
@@ -20,13 +21,11 @@ from lsvision.archive.work import (
     HashInput,
     InputHash,
     MatchStrip,
-    ProductPlace,
     StripResult,
     Work,
 )
-from lsvision.errors import NothingMeasuredError
+from lsvision.errors import FileFormatError, NothingMeasuredError
 from lsvision.io import create_product, naming_full_disk
-from lsvision.stages.correction.uncertainty import drift_per_metre
 
 WORK_FOLDER = ".work"
 
@@ -57,28 +56,7 @@ class ScanJob:
     def __init__(self, planned: PlannedScan, place: Place) -> None:
         self.planned, self._place = planned, place
         known = place.ledger.scan(planned.key)
-        calibration = planned.calibration.calibration
-        sideways, in_depth = calibration.motion.drift_mm_per_m
-        untouched = known is not None and known.stamp == planned.files.stamp
-        place.ledger.put_scan(
-            ScanRow(
-                scan=planned.key,
-                path=planned.files.path,
-                status="running",
-                lines=planned.lines,
-                missing_lines=planned.missing_lines,
-                stamp=planned.files.stamp,
-                input_sha256=known.input_sha256 if known is not None and untouched else "",
-                calibration=str(planned.calibration.path),
-                calibration_sha256=planned.calibration.sha256,
-                config_sha256=place.processing.sha256,
-                version=__version__,
-                verdict=calibration.verdict,
-                sideways_mm_per_m=sideways,
-                in_depth_mm_per_m=in_depth,
-                drift_sigma_mm_per_m=max(drift_per_metre(calibration.motion)),
-            )
-        )
+        place.ledger.put_scan(running_row(planned, place.processing, known))
 
     def next_tasks(self) -> list[Task]:
         """Tasks of the first step whose result is missing, to be run in any order and at once; none when all are there.
@@ -89,7 +67,13 @@ class ScanJob:
             NothingMeasuredError: less of the product was measured than ``min_measured_share``.
             WriteError: the disk is full.
         """
-        tasks = self._hashing() or self._matching() or self._correcting() or self._finishing()
+        tasks = (
+            self._hashing()
+            or self._matching()
+            or self._finding_line_motion()
+            or self._correcting()
+            or self._finishing()
+        )
         if tasks:
             self.planned.files.check_unchanged()
         return tasks
@@ -110,23 +94,23 @@ class ScanJob:
                     row, lines=result.lines, measured_cells=cells.count, lowest_mm=cells.lowest_mm,
                     highest_mm=cells.highest_mm,
                 )  # fmt: skip
+            elif isinstance(result, FoundLineMotion):
+                row = replace(row, lines=result.lines)
             self._place.ledger.put_strip(row)
 
     def finish(self) -> ScanRow:
-        """Record that the scan is done, and remove what was made on the way, except its depth."""
+        """Record that the scan is done, and remove what was made on the way, except its depth and line motion."""
         self._work.mkdir(parents=True, exist_ok=True)
+        results = self._results
         for other in self._work.iterdir():
-            if other == self._depth_store:
+            if other == results.depth_store:
                 remove_partial_chunks(other)
-            else:
+            elif other.is_dir():
                 shutil.rmtree(other, ignore_errors=True)
+            elif other != results.line_motion_store:
+                other.unlink(missing_ok=True)
         strips = self._place.ledger.strips(self.planned.key)
-        row = replace(
-            self._row,
-            status="done",
-            seconds=sum(strip.seconds for strip in strips),
-            measured_share=self._measured_share(),
-        )
+        row = finished_row(self._row, strips, self._measured_share(), self._line_motion())
         self._place.ledger.put_scan(row)
         return row
 
@@ -142,41 +126,63 @@ class ScanJob:
         return [Task(self.planned.key, HashInput(self.planned.files))]
 
     def _matching(self) -> list[Task]:
-        if self._depth_store is None:
+        results, planned = self._results, self.planned
+        store = results.depth_store
+        if store is None:
             return []
         config, with_sigma = self._place.processing.disparity, self._place.processing.with_sigma
-        planned, store = self.planned, self._depth_store
         if not store.is_dir():
-            check_own(Path(self._product.final), planned, self._row.input_sha256)
+            check_own(Path(results.product.final), planned, results.input_sha256)
             self._place.ledger.forget_strips(planned.key, "disparity")
             with naming_full_disk(store):
                 self._work.mkdir(parents=True, exist_ok=True)
                 create_depth_store(store, planned.lines, planned.width, config.work_lines, with_sigma=with_sigma)
         strips = range(-(-planned.lines // config.work_lines))
         work = [MatchStrip(planned.files, number, str(store), config, with_sigma) for number in strips]
-        return self._missing("disparity", self._depth_key, work)
+        return self._missing("disparity", results.depth_key, work)
+
+    def _finding_line_motion(self) -> list[Task]:
+        results, planned = self._results, self.planned
+        store = results.line_motion_store
+        if store is None:
+            return []
+        if self._line_motion() is None:
+            check_own(Path(results.product.final), planned, results.input_sha256)
+            self._place.ledger.forget_strips(planned.key, "line_motion")
+            with naming_full_disk(store):
+                self._work.mkdir(parents=True, exist_ok=True)
+        depth = str(results.depth_store) if results.depth_store else None
+        n = tuple(planned.calibration.calibration.motion.n.tolist())
+        processing = self._place.processing
+        work = FindLineMotion(planned.files, depth, processing.disparity, n, processing.line_motion, str(store))
+        return self._missing("line_motion", results.line_motion_key, [work])
 
     def _correcting(self) -> list[Task]:
         if self._is_renamed():
             return []
-        planned, working = self.planned, Path(self._product.working)
+        planned, results, found = self.planned, self._results, self._line_motion()
+        working = Path(results.product.working)
         if not working.is_dir():
-            check_own(Path(self._product.final), planned, self._row.input_sha256)
+            check_own(Path(results.product.final), planned, results.input_sha256)
             self._place.ledger.forget_strips(planned.key, "product")
             partial = working.with_name(f"{working.name}.partial")
-            with naming_full_disk(self._product.final):
+            with naming_full_disk(results.product.final):
                 self._work.mkdir(parents=True, exist_ok=True)
-                layout = product_layout(planned, self._place.processing, self._row.input_sha256, self._strips_key)
+                layout = product_layout(
+                    planned, self._place.processing, results.input_sha256, results.product_key, found
+                )
                 create_product(partial, layout)
                 partial.rename(working)
         motion = planned.calibration.calibration.motion
         n, covariance = tuple(motion.n.tolist()), tuple(map(tuple, motion.covariance.tolist()))
-        store = str(self._depth_store) if self._depth_store else None
+        store = str(results.depth_store) if results.depth_store else None
+        line_motion = None if found is None else (str(results.line_motion_store), found.sha256)
         source = CorrectionInput(
-            planned.files, store, self._place.processing.disparity, n, covariance, planned.correction, planned.grid
-        )
-        work = [CorrectStrip(source, number, self._product) for number in range(planned.product_strips)]
-        return self._missing("product", self._strips_key, work)
+            planned.files, store, self._place.processing.disparity, n, covariance, planned.correction, planned.grid,
+            line_motion,
+        )  # fmt: skip
+        work = [CorrectStrip(source, number, results.product) for number in range(planned.product_strips)]
+        return self._missing("product", results.product_key, work)
 
     def _finishing(self) -> list[Task]:
         if self._is_renamed():
@@ -187,15 +193,27 @@ class ScanJob:
                 f"{self.planned.files.path}: {measured:.2%} of the product's cells were measured, expected at least "
                 f"{least:.2%} (correction.min_measured_share); do height_range_mm and the rig fit the scan?"
             )
-        finish = FinishProduct(self._product, self._strips_key, self._measured_cells(), self._place.verify)
+        finish = FinishProduct(
+            self._results.product, self._results.product_key, self._measured_cells(), self._place.verify
+        )
         return [Task(self.planned.key, finish)]
+
+    def _line_motion(self) -> StoredLineMotion | None:
+        """What was found of the motion from line to line; None where none is corrected or the file is not whole."""
+        results = self._results
+        if results.line_motion_store is None:
+            return None
+        try:
+            return StoredLineMotion.read(results.line_motion_store, results.line_motion_origin, self.planned.lines)
+        except FileFormatError:
+            return None
 
     def _is_renamed(self) -> bool:
         """Whether the product has its final name, be it since an earlier run that was ended before it recorded that."""
-        strips = self._place.ledger.finished_strips(self.planned.key, "product", self._strips_key)
-        if Path(self._product.working).is_dir() or len(strips) < self.planned.product_strips:
+        strips = self._place.ledger.finished_strips(self.planned.key, "product", self._results.product_key)
+        if Path(self._results.product.working).is_dir() or len(strips) < self.planned.product_strips:
             return False
-        return is_finished(self._product.final, self._strips_key)
+        return is_finished(self._results.product.final, self._results.product_key)
 
     def _missing(self, stage: Stage, key: str, work: Sequence[Work]) -> list[Task]:
         finished = self._place.ledger.finished_strips(self.planned.key, stage, key)
@@ -206,7 +224,7 @@ class ScanJob:
         ]
 
     def _measured_cells(self) -> int:
-        strips = self._place.ledger.finished_strips(self.planned.key, "product", self._strips_key)
+        strips = self._place.ledger.finished_strips(self.planned.key, "product", self._results.product_key)
         return measured_cells(strips.values()).count
 
     def _measured_share(self) -> float:
@@ -221,29 +239,8 @@ class ScanJob:
     def _work(self) -> Path:
         return self._place.work / key_of(self.planned.key)[:16]
 
-    # What depends on the scan's hash is asked for only when that is known. The size of what is stored is part of its
-    # key: a plan made while the scan changed must not leave stores that do not fit the next.
-
-    @cached_property
-    def _depth_key(self) -> str:
-        processing, planned = self._place.processing, self.planned
-        key = depth_key(self._row.input_sha256, processing.disparity, processing.with_sigma, __version__)
-        return key_of(key, planned.lines, planned.width, processing.missing_lines)
-
-    @cached_property
-    def _strips_key(self) -> str:
-        processing = self._place.processing
-        sha256, correction = self.planned.calibration.sha256, processing.correction
-        key = product_key(self._depth_key, sha256, correction, processing.repair_encoder)
-        return key_of(key, self.planned.correction.strip_rows, asdict(self.planned.grid))
-
     @property
-    def _depth_store(self) -> Path | None:
-        """Where the matched depth is stored; None where none is."""
-        stored = self.planned.matched and self._place.keep_depth
-        return self._work / f"depth-{self._depth_key[:16]}" if stored else None
-
-    @property
-    def _product(self) -> ProductPlace:
-        working = self._work / f"product-{self._strips_key[:16]}.zarr"
-        return ProductPlace(str(working), str(product_path(self._place.output, self.planned.key)))
+    def _results(self) -> ScanResults:
+        """What depends on the scan's hash is asked for only when that is known."""
+        row, place = self._row, self._place
+        return ScanResults(self.planned, place.processing, row.input_sha256, self._work, place.output, place.keep_depth)

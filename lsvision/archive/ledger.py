@@ -20,7 +20,7 @@ _OF_THE_DISK = {
     sqlite3.SQLITE_LOCKED, sqlite3.SQLITE_NOMEM,
 }  # fmt: skip
 
-Stage = Literal["disparity", "product"]
+Stage = Literal["disparity", "line_motion", "product"]
 Status = Literal["running", "stopped", "done", "failed"]  # a scan as running while no run is at work was stopped
 
 log = logging.getLogger(__name__)
@@ -35,6 +35,8 @@ class ScanRow:
     ``missing_lines`` counts those of ``lines`` that are not there in one of the images.
     ``verdict`` is its calibration's, empty where it is not known; ``sideways_mm_per_m`` and ``in_depth_mm_per_m`` are
     the motion that was corrected, ``drift_sigma_mm_per_m`` the largest standard deviation of a position, mm per metre.
+    ``line_motion`` says where the motion from line to line came from and what was found of every component; ``rms_``
+    are those of the components that were corrected, zero for the others.
     """
 
     scan: str
@@ -55,6 +57,11 @@ class ScanRow:
     in_depth_mm_per_m: float = 0.0
     drift_sigma_mm_per_m: float = 0.0
     missing_lines: int = 0
+    line_motion: str = ""
+    rms_dx_mm: float = 0.0
+    rms_dz_mm: float = 0.0
+    rms_roll_rad: float = 0.0
+    rms_dy_mm: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -84,7 +91,7 @@ class Ledger:
     """The open ledger; every call that writes is one transaction. One process writes, any number may read.
 
     A ledger of version 1 is emptied: what it recorded was made by an earlier version and is made again. One of
-    version 2 gets the columns that it lacks.
+    a later version gets the columns that it lacks.
 
     Raises:
         FileFormatError: the file is no ledger, or one of a later version.

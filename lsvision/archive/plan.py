@@ -1,11 +1,12 @@
 """What a run has to do, before it starts: which scans, how long it will take and how large it will get."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from lsvision import __version__
 from lsvision.archive.ledger import ScanRow
+from lsvision.archive.line_motion import LineMotionChoice
 from lsvision.archive.planned import PlannedScan, Processing, plan_scan
 from lsvision.archive.product import product_path
 from lsvision.archive.sources.calibrations import DatedCalibration
@@ -13,7 +14,7 @@ from lsvision.archive.sources.catalogue import Found
 from lsvision.errors import LsvisionError
 
 # Seconds of a pixel and stage on one core, until the ledger knows better.
-_USUAL_SECONDS_PER_PX = {"disparity": 1.5e-6, "product": 1.0e-6}
+_USUAL_SECONDS_PER_PX = {"disparity": 1.5e-6, "line_motion": 0.1e-6, "product": 1.0e-6}
 
 
 @dataclass(frozen=True)
@@ -23,6 +24,7 @@ class Plan:
     to_do: list[PlannedScan]
     unchanged: list[PlannedScan]
     faulty: dict[Found, str]
+    line_motion: LineMotionChoice = field(default_factory=LineMotionChoice)
 
 
 def plan_run(
@@ -37,7 +39,7 @@ def plan_run(
     Args:
         known: the rows of the ledger.
     """
-    plan = Plan([], [], {})
+    plan = Plan([], [], {}, processing.line_motion)
     for item in found:
         try:
             product_path(output, item.key)
@@ -55,7 +57,12 @@ def predicted_seconds(plan: Plan, seconds_per_line: Mapping[str, float], workers
     """How long a run will take, by the mean time of a line so far, else by the usual time of a pixel."""
     seconds = 0.0
     for scan in plan.to_do:
-        for stage, lines in (("disparity", scan.lines if scan.matched else 0), ("product", scan.grid.rows)):
+        lines_of = {
+            "disparity": scan.lines if scan.matched else 0,
+            "line_motion": 0 if plan.line_motion.origin(scan.logged) == "none" else scan.lines,
+            "product": scan.grid.rows,
+        }
+        for stage, lines in lines_of.items():
             seconds += lines * seconds_per_line.get(stage, scan.width * _USUAL_SECONDS_PER_PX[stage])
     return seconds / workers
 

@@ -1,11 +1,12 @@
 """One scan as it will be processed: its files, its calibration, and the grid and strips of its product."""
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 
 import psutil
 
 from lsvision.archive.identity import ScanFiles, key_of, options_without_strips, stamp_of
+from lsvision.archive.line_motion import LineMotionChoice
 from lsvision.archive.sources.calibrations import DatedCalibration, calibration_for
 from lsvision.archive.sources.catalogue import Found
 from lsvision.errors import FileFormatError
@@ -34,6 +35,7 @@ class Processing:
     repair_encoder: bool
     worker_memory_mb: int | None
     missing_lines: MissingLines = "refuse"
+    line_motion: LineMotionChoice = field(default_factory=LineMotionChoice)
 
     @property
     def with_sigma(self) -> bool:
@@ -44,7 +46,8 @@ class Processing:
     def sha256(self) -> str:
         """Hash of the options that products depend on; the height of strips of rows is not part of it."""
         options = options_without_strips(self.correction)
-        return key_of(asdict(self.disparity), options, self.repair_encoder, self.missing_lines)
+        kept = self.repair_encoder, self.missing_lines, self.line_motion.key
+        return key_of(asdict(self.disparity), options, *kept)
 
 
 @dataclass(frozen=True)
@@ -53,6 +56,7 @@ class PlannedScan:
 
     ``matched`` says whether its depth has to be matched, ``cell_bytes`` is the size of a cell of its product, and
     ``correction`` has the strips that fit the memory of a worker. ``missing_lines`` counts those that are not there.
+    ``logged`` says whether the scan has a log of its motion from line to line.
     """
 
     key: str
@@ -65,6 +69,7 @@ class PlannedScan:
     grid: ProductGrid
     correction: CorrectionConfig
     missing_lines: int = 0
+    logged: bool = False
 
     @property
     def product_strips(self) -> int:
@@ -76,7 +81,8 @@ def plan_scan(found: Found, calibrations: Sequence[DatedCalibration], processing
     """Read a scan, but not its images, and plan its product.
 
     Raises:
-        FileFormatError: the scan cannot be read, or not be processed in a worker's memory.
+        FileFormatError: the scan or the file of its line motion cannot be read, or it not be processed in a worker's
+            memory.
         CalibrationError: no calibration fits it, or more than one does.
         ConfigError: the pitch of the product is not positive.
     """
@@ -86,6 +92,8 @@ def plan_scan(found: Found, calibrations: Sequence[DatedCalibration], processing
     stamp = stamp_of(found.path)  # of files that are known to be images: a folder of any other kind may have no end
     calibration = calibration_for(scan, calibrations)
     motion = calibration.calibration.motion
+    if processing.line_motion.origin(scan.line_motion is not None) == "file":
+        processing.line_motion.read_file(scan.lines, scan.travel)  # what does not fit is noticed before anything starts
     grid, frame = plan_product(scan, motion, processing.correction), ProductFrame(scan.rig, scan.travel, motion.n)
     return PlannedScan(
         key=found.key,
@@ -99,6 +107,7 @@ def plan_scan(found: Found, calibrations: Sequence[DatedCalibration], processing
         grid=grid,
         correction=replace(processing.correction, strip_rows=_strip_rows(scan, frame, grid, processing)),
         missing_lines=scan.missing_lines,
+        logged=scan.line_motion is not None,
     )
 
 

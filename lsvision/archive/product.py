@@ -6,6 +6,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 from lsvision import __version__
+from lsvision.archive.line_motion import StoredLineMotion
 from lsvision.archive.planned import PlannedScan, Processing
 from lsvision.errors import FileFormatError
 from lsvision.geometry import ProductFrame, zero_disparity_mm
@@ -35,12 +36,15 @@ def product_path(output: Path, key: str) -> Path:
     return path_inside(output, f"{key}.zarr")
 
 
-def product_layout(planned: PlannedScan, processing: Processing, input_sha256: str, key: str) -> ProductLayout:
+def product_layout(
+    planned: PlannedScan, processing: Processing, input_sha256: str, key: str, found: StoredLineMotion | None = None
+) -> ProductLayout:
     """Layout of a scan's product, one chunk per strip; its metadata say everything that it was made from.
 
     Args:
         input_sha256: hash of the scan's files.
         key: hash of everything that the product depends on.
+        found: motion from line to line; None where none is corrected.
 
     Raises:
         FileFormatError: the scan cannot be read any more.
@@ -83,11 +87,13 @@ def product_layout(planned: PlannedScan, processing: Processing, input_sha256: s
             **({"pair": relation.metadata} if relation is not None else {}),
             **({"encoder_repair": asdict(repair)} if repair is not None else {}),
             **({"missing_lines": _missing_in(scan)} if scan.missing else {}),
+            "line_motion": {"source": "none"} if found is None else found.metadata(scan.travel),
             "correction": asdict(planned.correction),
             "key": key,
         },
         uncertainty=planned.correction.uncertainty,
         source_dtype=source_dtype(planned.lines),
+        line_motion=None if found is None else found.motion,
     )
 
 

@@ -2,7 +2,7 @@
 
 import sqlite3
 
-VERSION = 4  # of the tables; version 1 recorded none, versions 2 and 3 lacked the last columns of the scans
+VERSION = 5  # of the tables; version 1 recorded none, versions 2 to 4 lacked the last columns of the scans
 
 _TABLES = (
     """
@@ -29,6 +29,14 @@ _SINCE_VERSION_3 = (
     "drift_sigma_mm_per_m REAL NOT NULL DEFAULT 0.0",
 )
 _SINCE_VERSION_4 = ("missing_lines INTEGER NOT NULL DEFAULT 0",)
+_SINCE_VERSION_5 = (
+    "line_motion TEXT NOT NULL DEFAULT ''",
+    "rms_dx_mm REAL NOT NULL DEFAULT 0.0",
+    "rms_dz_mm REAL NOT NULL DEFAULT 0.0",
+    "rms_roll_rad REAL NOT NULL DEFAULT 0.0",
+    "rms_dy_mm REAL NOT NULL DEFAULT 0.0",
+)
+_ADDED = {3: _SINCE_VERSION_3, 4: _SINCE_VERSION_4, 5: _SINCE_VERSION_5}
 
 
 def version_of(db: sqlite3.Connection) -> int:
@@ -47,7 +55,7 @@ def bring_up_to_date(db: sqlite3.Connection, version: int) -> bool:
             db.execute(table)
         dropped = bool(old)
     if version < VERSION:
-        for column in (*(_SINCE_VERSION_3 if version < 3 else ()), *_SINCE_VERSION_4):
+        for column in (column for since, columns in _ADDED.items() if version < since for column in columns):
             db.execute(f"ALTER TABLE scans ADD COLUMN {column}")
         db.execute(f"PRAGMA user_version = {VERSION}")
     return dropped

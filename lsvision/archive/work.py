@@ -5,9 +5,6 @@ that was lost half-way, or ran twice, does no harm. Each that reads a scan raise
 planned ones before and after: what is recorded was made from those.
 """
 
-import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -15,17 +12,18 @@ from typing import Protocol
 
 import torch
 
+from lsvision.archive import opened
 from lsvision.archive.depth_store import open_depth_store, remove_partial_chunks, write_depth
 from lsvision.archive.identity import ScanFiles
+from lsvision.archive.line_motion import open_line_motion
+from lsvision.archive.opened import open_depth, open_scan, planned_files
 from lsvision.archive.product import damage_of, is_finished
 from lsvision.errors import LsvisionError, ScanChangedError
-from lsvision.image.stereo.relation import PairRelation
 from lsvision.io import (
     MeasuredCells,
     ProductRows,
     complete_product,
     naming_full_disk,
-    read_scan,
     remove_partial_siblings,
     scan_sha256,
 )
@@ -33,8 +31,7 @@ from lsvision.stages.correction.config import CorrectionConfig
 from lsvision.stages.correction.correct import Correction
 from lsvision.stages.correction.grid import plan_product
 from lsvision.stages.disparity.config import DisparityConfig
-from lsvision.stages.disparity.depth import depth_of, relation_of_scan
-from lsvision.types import DepthSource, Motion, ProductGrid, Scan
+from lsvision.types import Motion, ProductGrid
 
 
 class Work(Protocol):
@@ -83,7 +80,7 @@ class HashInput:
 
     def run(self) -> InputHash:
         """Read every byte."""
-        with _planned_files(self.scan):
+        with planned_files(self.scan):
             return InputHash(scan_sha256(self.scan.path))
 
 
@@ -101,8 +98,8 @@ class MatchStrip:
         """Match the strip."""
         start = self.number * self.config.work_lines
         stop = min(start + self.config.work_lines, self.scan.lines)
-        with _planned_files(self.scan):
-            depth = _open_depth(self.scan, self.config).read(start, stop)
+        with planned_files(self.scan):
+            depth = open_depth(self.scan, self.config).read(start, stop)
         with naming_full_disk(self.depth_store):
             write_depth(self.depth_store, start, depth, with_sigma=self.with_sigma)
         return StripResult(stop - start, MeasuredCells(int(torch.isfinite(depth.z).sum())))
@@ -112,7 +109,8 @@ class MatchStrip:
 class CorrectionInput:
     """What the strips of a product are corrected from.
 
-    Where there is no store of the depth, it is the scan's own, or matched where it is read.
+    Where there is no store of the depth, it is the scan's own, or matched where it is read. ``line_motion`` is
+    the store of that and its hash; None where none is corrected.
     """
 
     scan: ScanFiles
@@ -122,6 +120,7 @@ class CorrectionInput:
     covariance: tuple[tuple[float, ...], ...]
     config: CorrectionConfig
     grid: ProductGrid
+    line_motion: tuple[str, str] | None = None
 
 
 @dataclass(frozen=True)
@@ -136,7 +135,7 @@ class CorrectStrip:
         """Correct the rows."""
         step, rows = self.source.config.strip_rows, self.source.grid.rows
         start = self.number * step
-        with _planned_files(self.source.scan):
+        with planned_files(self.source.scan):
             strip = _open_correction(self.source).strip((start, min(start + step, rows)))
         with naming_full_disk(self.product.final):
             _open_product(self.product.working).write(strip)
@@ -179,62 +178,22 @@ class VerifyProduct:
         return ProductState(damage_of(self.product, self.measured_cells))
 
 
-@contextmanager
-def _planned_files(files: ScanFiles) -> Iterator[None]:
-    """Read a scan within the block; an error where it was not the planned one before and after.
-
-    What was kept of it in memory is dropped then: it may be of either content.
-    """
-    global _opened
-    try:
-        files.check_unchanged()
-        try:
-            yield
-        finally:
-            files.check_unchanged()  # what was wrong with the files is the change's fault then
-    except ScanChangedError:
-        _open_scan.cache_clear()
-        _relation.cache_clear()
-        _opened = threading.local()  # that of every thread
-        raise
-
-
-# Neighbouring strips of a scan share the parts of the files that were decoded last.
-@lru_cache(maxsize=2)
-def _open_scan(files: ScanFiles) -> Scan:
-    scan = read_scan(files.path, repair_encoder=files.repair_encoder, missing_lines=files.missing_lines)
-    if scan.lines != files.lines:
-        raise ScanChangedError(files.path)
-    return scan
-
-
-def _open_depth(files: ScanFiles, config: DisparityConfig) -> DepthSource:
-    return depth_of(_open_scan(files), config, _relation(files, config))
-
-
-# Measuring it anew for each strip would cost a tenth of matching.
-@lru_cache(maxsize=2)
-def _relation(files: ScanFiles, config: DisparityConfig) -> PairRelation | None:
-    return relation_of_scan(_open_scan(files), config)
-
-
 def _open_correction(source: CorrectionInput) -> Correction:
     """The latest of the thread stays open: neighbouring strips see the same lines at their seam."""
-    if getattr(_opened, "source", None) != source:
-        scan = _open_scan(source.scan)
+    latest = opened.latest
+    if getattr(latest, "source", None) != source:
+        scan = open_scan(source.scan)
         depth = (
-            open_depth_store(source.depth_store) if source.depth_store else _open_depth(source.scan, source.disparity)
+            open_depth_store(source.depth_store) if source.depth_store else open_depth(source.scan, source.disparity)
         )
         motion = Motion(*(torch.tensor(values, dtype=torch.float64) for values in (source.n, source.covariance)))
         if plan_product(scan, motion, source.config) != source.grid:
             raise ScanChangedError(source.scan.path)
-        _opened.correction = Correction(scan, depth, motion, source.config, source.grid)
-        _opened.source = source
-    correction: Correction = _opened.correction
+        shaken = open_line_motion(*source.line_motion, scan) if source.line_motion else None
+        latest.correction = Correction(scan, depth, motion, source.config, source.grid, shaken)
+        latest.source = source
+    correction: Correction = latest.correction
     return correction
-
-
-_opened = threading.local()
 
 
 # Opening costs as much as computing a small strip; folders of one name are always laid out alike.

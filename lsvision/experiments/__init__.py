@@ -40,6 +40,7 @@ EXPERIMENTS = {
     "simulate": Experiment("simulate", "run_simulate", "SimulateSettings"),
     "calibrate": Experiment("calibrate", "run_calibrate", "CalibrateSettings"),
     "correct": Experiment("correct", "run_correct", "CorrectSettings"),
+    "motion": Experiment("motion", "run_motion", "MotionSettings"),
     "reprocess": Experiment("reprocess", "run_reprocess", "ReprocessSettings"),
     "status": Experiment("reprocess", "run_status", "StatusSettings"),
     "validate": Experiment("validate", "run_validate", "ValidateSettings"),

@@ -6,17 +6,28 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from lsvision.archive import Outcome, PlannedScan, Processing, Task, plan_one, process_one, product_rows
+from lsvision.archive import (
+    LineMotionChoice,
+    Outcome,
+    PlannedScan,
+    Processing,
+    Task,
+    plan_one,
+    process_one,
+    product_rows,
+)
 from lsvision.experiments.settings import RunSettings
 from lsvision.image.tiling import keep_freed_memory
 from lsvision.io import ExportFormat, export_product, read_product, write_json
 from lsvision.report import product_report
+from lsvision.report.line_motion_words import line_motion_words
 from lsvision.report.progress import ProgressBars, progress_bars
 from lsvision.report.summary import drift_in_words
 from lsvision.schema import Text
 from lsvision.stages.correction.config import CorrectionConfig
 from lsvision.stages.correction.uncertainty import drift_per_metre
 from lsvision.stages.disparity.config import DisparityConfig
+from lsvision.stages.line_motion.config import LineMotionConfig
 from lsvision.types import MissingLines, RefusedVerdict, Verdict
 
 log = logging.getLogger(__name__)
@@ -27,8 +38,9 @@ class CorrectSettings(RunSettings):
     """Options of the experiment; the product is ``<scan's name>.zarr`` in ``output``, the run's folder if None.
 
     A scan without some of its frames or Zarr chunks is refused; with ``missing_lines`` "mark" their lines are not
-    measured. The formats of ``export`` are written beside it. A calibration without a usable n is refused, unless
-    ``accept`` has its verdict.
+    measured. ``line_motion`` is ``none``, a file, or ``auto``: the scan's own log, else what its profile shows by
+    ``registration``. The formats of ``export`` are written beside it. A calibration without a usable n is refused,
+    unless ``accept`` has its verdict.
     """
 
     scan: Text
@@ -37,6 +49,8 @@ class CorrectSettings(RunSettings):
     correction: CorrectionConfig
     repair_encoder: bool = False
     missing_lines: MissingLines = "refuse"
+    line_motion: Text = "auto"
+    registration: LineMotionConfig = field(default_factory=LineMotionConfig)
     accept: list[RefusedVerdict] = field(default_factory=list)
     export: list[ExportFormat] = field(default_factory=list)
     output: Text | None = None
@@ -52,7 +66,8 @@ class ProductSummary:
     which whole ones were taken into account, its gain, offset and curve; None where the camera measured the depth.
     ``encoder_repair`` has the number of lines whose travel was interpolated and the largest standard deviation of their
     travel, mm; None where none was.
-    ``missing_lines`` counts the lines of the scan that were not there.
+    ``missing_lines`` counts the lines of the scan that were not there. ``line_motion`` has the source of the motion
+    from line to line, its components with rms, sigma and reason, and the wavelengths that may be shape.
     """
 
     path: str
@@ -68,6 +83,7 @@ class ProductSummary:
     pair: dict[str, Any] | None
     encoder_repair: dict[str, Any] | None
     missing_lines: int
+    line_motion: dict[str, Any]
 
 
 def run_correct(settings: CorrectSettings, folder: Path) -> None:
@@ -78,6 +94,7 @@ def run_correct(settings: CorrectSettings, folder: Path) -> None:
         settings.repair_encoder,
         worker_memory_mb=None,
         missing_lines=settings.missing_lines,
+        line_motion=LineMotionChoice.of(settings.line_motion, settings.registration),
     )
     planned = plan_one(settings.scan, settings.calibration, processing, settings.accept)
     if planned.calibration.warning:
@@ -98,6 +115,8 @@ def run_correct(settings: CorrectSettings, folder: Path) -> None:
     )  # fmt: skip
     motion = planned.calibration.calibration.motion
     log.info("calibration %s, corrected motion %s", summary.verdict, drift_in_words(motion))
+    for line in line_motion_words(summary.line_motion):
+        log.info("%s", line)
     if summary.pair is not None:
         log.info("%s", _pair_in_words(summary.pair))
     if summary.encoder_repair is not None:
@@ -157,4 +176,5 @@ def make_product(planned: PlannedScan, processing: Processing, output: Path, bar
         pair=_entry(metadata, "pair"),
         encoder_repair=_entry(metadata, "encoder_repair"),
         missing_lines=planned.missing_lines,
+        line_motion=_entry(metadata, "line_motion") or {},
     )

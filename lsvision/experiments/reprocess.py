@@ -12,6 +12,7 @@ from lsvision.archive import (
     Engine,
     EngineConfig,
     Ledger,
+    LineMotionChoice,
     LocalEngine,
     Outcome,
     Place,
@@ -41,6 +42,7 @@ from lsvision.report.progress import progress_bars
 from lsvision.schema import PositiveInt, Text
 from lsvision.stages.correction.config import CorrectionConfig
 from lsvision.stages.disparity.config import DisparityConfig
+from lsvision.stages.line_motion.config import LineMotionConfig
 from lsvision.types import MissingLines, RefusedVerdict
 
 log = logging.getLogger(__name__)
@@ -50,6 +52,8 @@ log = logging.getLogger(__name__)
 class ReprocessSettings(RunSettings):
     """Options of the experiment; products lie below ``output`` as their scans do below ``archive``.
 
+    ``line_motion`` is ``none``, a file for all scans, or ``auto``: a scan's own log, else what its profile shows by
+    ``registration``.
     A calibration without a usable n is refused, unless ``accept`` has its verdict.
     """
 
@@ -63,6 +67,8 @@ class ReprocessSettings(RunSettings):
     verify: bool = False
     repair_encoder: bool = False
     missing_lines: MissingLines = "refuse"
+    line_motion: Text = "auto"
+    registration: LineMotionConfig = field(default_factory=LineMotionConfig)
     accept: list[RefusedVerdict] = field(default_factory=list)
 
 
@@ -150,6 +156,7 @@ def _processing(settings: ReprocessSettings) -> Processing:
         settings.repair_encoder,
         settings.engine.worker_memory_mb,
         settings.missing_lines,
+        LineMotionChoice.of(settings.line_motion, settings.registration),
     )
 
 

@@ -4,6 +4,7 @@ from lsvision.io.atomic import naming_full_disk, remove_partial_siblings, write_
 from lsvision.io.formats.calibration import check_rig_match, read_calibration, write_calibration
 from lsvision.io.formats.checksum import scan_sha256
 from lsvision.io.formats.encoder import read_encoder, write_encoder
+from lsvision.io.formats.line_motion import read_line_motion, write_line_motion
 from lsvision.io.formats.rig import read_rig, rig_from_dict, rig_to_dict, write_rig
 from lsvision.io.formats.scan import NewScan, read_scan, scan_files, write_scan
 from lsvision.io.images.line_image import open_line_image
@@ -38,6 +39,7 @@ __all__ = [
     "product_writer",
     "read_calibration",
     "read_encoder",
+    "read_line_motion",
     "read_product",
     "read_rig",
     "read_scan",
@@ -51,6 +53,7 @@ __all__ = [
     "write_json",
     "write_laz",
     "write_line_image",
+    "write_line_motion",
     "write_ply",
     "write_rig",
     "write_scan",

@@ -46,10 +46,11 @@ def reprocess_report(
                 (
                     "scan", "status", "lines", "measured [%]", "work [s]", "calibration", "verdict",
                     "sideways [mm/m]", "in depth [mm/m]", "drift, one sigma [mm/m]",
+                    "δx, rms [mm]", "δz, rms [mm]", "motion from line to line",
                 ),
                 [
                     (row.scan, row.status, str(row.lines), f"{100 * row.measured_share:.1f}", f"{row.seconds:.1f}",
-                     Path(row.calibration).name, row.verdict, *_drift_columns(row))
+                     Path(row.calibration).name, row.verdict, *_drift_columns(row), *_line_motion_columns(row))
                     for row in rows.values()
                 ],
             ),
@@ -64,6 +65,12 @@ def _drift_columns(row: ScanRow) -> list[str]:
     """The corrected motion and its sigma, of a scan whose calibration is known."""
     values = (row.sideways_mm_per_m, row.in_depth_mm_per_m, row.drift_sigma_mm_per_m)
     return [f"{value:.3f}" if row.verdict else "" for value in values]
+
+
+def _line_motion_columns(row: ScanRow) -> tuple[str, ...]:
+    """The rms of the vibration that was corrected, where any was, and all that is known about it."""
+    shown = (f"{value:.3f}" if value > 0 else "" for value in (row.rms_dx_mm, row.rms_dz_mm))
+    return *shown, row.line_motion
 
 
 def _thumbnails(made: Sequence[ScanRow], output: Path) -> ReportFigure:

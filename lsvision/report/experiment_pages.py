@@ -13,6 +13,9 @@ from lsvision.report.calibration_figures import (
     rmse_by_iteration,
     stretch_by_iteration,
 )
+from lsvision.report.line_motion_figures import product_motion_figures
+from lsvision.report.line_motion_pages import findings_table
+from lsvision.report.line_motion_words import line_motion_words
 from lsvision.report.pages import Headline, Page, ReportFigure, Table, write_report
 from lsvision.report.product_figures import product_images
 from lsvision.report.space_figures import corners_in_space, surface_in_space
@@ -106,6 +109,7 @@ def product_report(
 ) -> None:
     """``report.html`` of a product: size, share of valid cells, its motion, colour and height of its beginning."""
     rows = min(product.shape[0], _SHOWN_ROWS)
+    line_motion = product.line_motion_metadata
     height = product.height(0, rows)
     measured = height[torch.isfinite(height)]
     span = f"{float(measured.min()):.2f} .. {float(measured.max()):.2f} mm" if measured.numel() else "nothing measured"
@@ -114,16 +118,19 @@ def product_report(
             "product", "Colour and height", product.color(0, rows), height, product.pitch_mm, product.origin_mm
         ),
         surface_in_space("surface", height, product.pitch_mm, product.origin_mm),
+        *product_motion_figures(product),
     ]
     page = Page(
         title=f"Corrected scan {product.path.stem}",
-        lead=f"Orthographic product of {product.metadata.get('scan', '')} in the frame of its motion.",
+        lead=f"Orthographic product of {product.metadata.get('scan', '')} in the frame of its motion; "
+        + ". ".join(line.strip() for line in line_motion_words(line_motion)),
         headlines=[
             Headline("Size", f"{product.shape[0]} x {product.shape[1]} cells", f"of {product.pitch_mm:.4f} mm"),
             Headline("Measured", f"{100 * valid_share:.1f} %", "of all cells"),
             Headline("Heights", span, f"first {rows} rows"),
             *_motion_headlines(calibration),
         ],
+        tables=[findings_table(line_motion)] if line_motion.get("components") else [],
         figures=figures,
         settings=settings,
         provenance={key: str(product.metadata[key]) for key in _PROVENANCE if key in product.metadata},

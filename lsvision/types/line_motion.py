@@ -46,7 +46,8 @@ class LineFinding:
             error = f" better than to {self.sigma * scale:.2g} {unit}" if self.sigma > 0 else ""
             return f"{name}: not observed, {self.reason}{error}"
         length = "" if self.length_mm is None else f", over lengths of {self.length_mm:.2g} mm"
-        return f"{name}: {self.rms * scale:.2g} {unit} rms, known to {self.sigma * scale:.2g} {unit}{length}"
+        known = f"known to {self.sigma * scale:.2g} {unit}" if self.sigma > 0 else "of unknown sigma"
+        return f"{name}: {self.rms * scale:.2g} {unit} rms, {known}{length}"
 
 
 @dataclass(frozen=True)

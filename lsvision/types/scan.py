@@ -10,6 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lsvision.schema import Checked, IntFrom2, Positive, PositiveInt
+from lsvision.types.line_motion import LineMotion
 
 Transport = Literal["forward", "reverse"]
 # What is done about lines of an image that are not there: the scan is refused, or goes on without them.
@@ -141,7 +142,7 @@ class DepthView:
 
 @dataclass(frozen=True)
 class Scan:
-    """One pass of an object under the rig."""
+    """One pass of an object under the rig; ``line_motion`` is what was logged of its motion from line to line."""
 
     path: Path
     rig: Rig
@@ -149,6 +150,7 @@ class Scan:
     images: StereoPair | DepthView
     color_registered: bool = True
     attributes: Mapping[str, str] = field(default_factory=dict)
+    line_motion: LineMotion | None = None
 
     @property
     def left(self) -> LineImage:

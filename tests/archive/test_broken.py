@@ -79,6 +79,7 @@ def settings(archive: Path, output: Path, **options: object) -> ReprocessSetting
         "engine": EngineConfig(workers=1),
         "disparity": PROCESSING.disparity,
         "correction": PROCESSING.correction,
+        "line_motion": "none",
     }
     return ReprocessSettings(**(values | options))
 

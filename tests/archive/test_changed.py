@@ -11,7 +11,7 @@ import tifffile
 import torch
 import zarr
 
-from lsvision.archive import LEDGER_FILE, WORK_FOLDER, Ledger, Place, find_scans, plan_run, process_scans, work
+from lsvision.archive import LEDGER_FILE, WORK_FOLDER, Ledger, Place, find_scans, opened, plan_run, process_scans
 from lsvision.archive import read_calibrations as read_all
 from lsvision.archive.identity import ScanFiles, stamp_of
 from lsvision.archive.tasks import Outcome, Task
@@ -66,8 +66,7 @@ def assert_made_afresh(root: Path, calibration: Path, output: Path, processing=S
     """The next run makes what a run that nothing disturbs makes, and nothing has to be deleted by hand."""
     rows, _ = process(root, calibration, output, processing=processing)
     assert [(row.status, row.error) for row in rows] == [("done", "")]
-    work._open_scan.cache_clear()  # as in a process of its own
-    work._opened.__dict__.clear()
+    opened.forget()  # as in a process of its own
     process(root, calibration, output.with_name("undisturbed"), processing=processing)
     assert_same_products(output.with_name("undisturbed"), output)
 

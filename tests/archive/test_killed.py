@@ -42,7 +42,8 @@ def start(archive: Path, output: Path, *options: str) -> subprocess.Popen:
             sys.executable, "-m", "lsvision.run", "+experiment=reprocess", f"archive={archive}",
             f"calibration={archive / 'calibration.json'}", f"output={output}", "engine.workers=2",
             "disparity.block_lines=32", "disparity.strip_lines=32", "disparity.halo_lines=8",
-            "correction.strip_rows=32", f"hydra.run.dir={output.with_name(output.name + '-run')}", *options,
+            "correction.strip_rows=32", "line_motion=none",
+            f"hydra.run.dir={output.with_name(output.name + '-run')}", *options,
         ],
         stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True,
     )  # fmt: skip

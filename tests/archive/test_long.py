@@ -79,7 +79,7 @@ peaks = []
 plan_one(scan, calibration, PROCESSING)
 peaks.append(peak())
 run_correct(CorrectSettings(name="correct", scan=str(scan), calibration=str(calibration), output=str(output),
-                            disparity=PROCESSING.disparity, correction=correction), output / "run")
+                            disparity=PROCESSING.disparity, correction=correction, line_motion="none"), output / "run")
 peaks.append(peak())
 run_validate(ValidateSettings(name="validate", product=str(output / "scan.zarr"), board=Board(12, 9, 90.0)),
              output / "run")

@@ -73,6 +73,7 @@ def test_terminal_summary_and_ledger_count_missing_lines(tmp_path, caplog, monke
     settings = CorrectSettings(
         name="correct", scan=str(scan), calibration=str(calibration), output=str(tmp_path / "one"),
         disparity=PROCESSING.disparity, correction=PROCESSING.correction, missing_lines="mark",
+        line_motion="none",
     )  # fmt: skip
     for number in (2, 3):
         (scan / "left" / f"{number}.png").unlink()

@@ -32,6 +32,7 @@ def correct(scan: Path, calibration: Path, output: Path, **options) -> None:
         output=str(output),
         disparity=PROCESSING.disparity,
         correction=options.pop("correction", PROCESSING.correction),
+        line_motion=options.pop("line_motion", "none"),
         **options,
     )
     run_correct(settings, output.with_name(f"{output.name}-run"))
@@ -46,6 +47,7 @@ def reprocess(archive: Path, calibration: Path, output: Path) -> None:
         engine=EngineConfig(workers=1),
         disparity=PROCESSING.disparity,
         correction=PROCESSING.correction,
+        line_motion="none",
     )
     run_reprocess(settings, output.with_name(f"{output.name}-run"))
 

@@ -107,20 +107,24 @@ def test_a_ledger_of_an_earlier_version_starts_anew(tmp_path, caplog):
         assert list(ledger.scans()) == ["b"]
 
 
-@pytest.mark.parametrize("version", [2, 3])
+@pytest.mark.parametrize("version", [2, 3, 4])
 def test_a_ledger_of_a_version_before_keeps_its_rows_and_gets_the_new_columns(tmp_path, caplog, version):
     path, row = tmp_path / "ledger.sqlite", ScanRow("a", "/a", "done", lines=7, version="v")
     with Ledger(path) as ledger:
         ledger.put_scan(row)
     with sqlite3.connect(path) as db:
-        of_version_3 = ("verdict", "sideways_mm_per_m", "in_depth_mm_per_m", "drift_sigma_mm_per_m")
-        for column in ("missing_lines", *(of_version_3 if version == 2 else ())):
+        since = {
+            3: ("verdict", "sideways_mm_per_m", "in_depth_mm_per_m", "drift_sigma_mm_per_m"),
+            4: ("missing_lines",),
+            5: ("line_motion", "rms_dx_mm", "rms_dz_mm", "rms_roll_rad", "rms_dy_mm"),
+        }
+        for column in (column for later, columns in since.items() if later > version for column in columns):
             db.execute(f"ALTER TABLE scans DROP COLUMN {column}")
         db.execute(f"PRAGMA user_version = {version}")
     db.close()
     with Ledger(path) as ledger:
         assert ledger.scans() == {"a": row}
-        known = replace(row, verdict="determined", sideways_mm_per_m=-25.0, drift_sigma_mm_per_m=0.3, missing_lines=3)
+        known = replace(row, verdict="determined", sideways_mm_per_m=-25.0, drift_sigma_mm_per_m=0.3, rms_dz_mm=0.2)
         ledger.put_scan(known)
         assert ledger.scan("a") == known
     assert not caplog.text

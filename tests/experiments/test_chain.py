@@ -60,6 +60,7 @@ def test_calibrate_finds_the_motion_and_correct_makes_the_board_square(scans, co
         command(
             "+experiment=correct",
             f"scan={scans / 'b'}",
+            "line_motion=none",
             f"calibration={tmp_path / 'run' / 'calibration.json'}",
             folder="corrected",
         )
@@ -90,7 +91,7 @@ def test_cameras_out_of_step_are_said(scans, command, tmp_path, capsys):
     right = scan.images.right.read(0, scan.lines)
     late = right[(torch.arange(scan.lines) - 2).clamp(min=0)]
     tifffile.imwrite(tmp_path / "late" / "right.tif", late.numpy(), photometric="rgb")
-    options = (f"scan={tmp_path / 'late'}", f"calibration={tmp_path / 'calibration.json'}")
+    options = (f"scan={tmp_path / 'late'}", f"calibration={tmp_path / 'calibration.json'}", "line_motion=none")
     assert command("+experiment=correct", *options) == 0
     said = capsys.readouterr()
     assert "right image is matched +2 lines later" in said.out + said.err

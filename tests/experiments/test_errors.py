@@ -136,7 +136,7 @@ def test_a_product_that_fails_half_way_leaves_nothing(command, tmp_path, monkeyp
     monkeypatch.setattr(Correction, "strip", failing)
     scan, calibration = make_scan(tmp_path / "scan", stereo=True), make_calibration(tmp_path / "calibration.json")
     overrides = ("+experiment=correct", f"scan={scan}", f"calibration={calibration}")
-    assert command(*overrides, "correction.strip_rows=32", folder="corrected") == 1
+    assert command(*overrides, "correction.strip_rows=32", "line_motion=none", folder="corrected") == 1
     assert made == [(0, 32)]
     assert "the disk is full" in capsys.readouterr().err
     assert sorted(path.name for path in (tmp_path / "corrected").iterdir()) == [".hydra", "lsvision.log"]

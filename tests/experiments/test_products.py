@@ -56,6 +56,7 @@ def correct(made: Path, *options: str) -> tuple[str, ...]:
         f"scan={made / 'scan'}",
         f"calibration={made / 'calibration.json'}",
         "correction.height_range_mm=[-30,30]",
+        "line_motion=none",
         *options,
     )
 
@@ -208,6 +209,7 @@ def test_reprocess_refuses_it_too_and_records_the_verdict_of_what_it_uses(made, 
     asked = (
         "+experiment=reprocess", f"archive={tmp_path / 'archive'}", f"calibration={unusable}",
         f"output={tmp_path / 'products'}", "engine.workers=1", "correction.height_range_mm=[-30,30]",
+        "line_motion=none",
     )  # fmt: skip
     assert command(*asked) == 1
     assert command(*asked, "accept=[not_converged]", folder="accepted") == 0

@@ -22,6 +22,7 @@ from lsvision.stages.calibration.config import CalibrationConfig
 from lsvision.stages.corners.config import CornersConfig
 from lsvision.stages.correction.config import CorrectionConfig
 from lsvision.stages.disparity.config import DisparityConfig
+from lsvision.stages.line_motion.config import LineMotionConfig
 from lsvision.types import CalibrationMethod
 
 CALIBRATION_METHODS = shape_of(CalibrationMethod).arguments
@@ -249,9 +250,12 @@ def test_files_of_a_stage_are_its_variants_and_defaults_are_the_dataclass():
     }
     variants = {f"disparity/{matcher}.yaml" for matcher, _ in RESOLVED}
     variants |= {f"calibration/{method}.yaml" for method in CALIBRATION_METHODS}
-    assert names == variants | {"corners/default.yaml", "correction/default.yaml"}
+    assert names == variants | {f"{stage}/default.yaml" for stage in ("corners", "correction", "line_motion")}
     assert CornersConfig(**composed("calibrate")["corners"]) == CornersConfig()
     assert CorrectionConfig(**composed("correct")["correction"]) == CorrectionConfig()
+    assert LineMotionConfig(**composed("correct")["registration"]) == LineMotionConfig()
+    narrow = composed("reprocess", "correction.height_range_mm=[-9,9]")["registration"]
+    assert LineMotionConfig(**narrow) == LineMotionConfig(height_range_mm=(-9.0, 9.0))
 
 
 def test_help_waits_for_no_library_of_the_experiments():

@@ -31,13 +31,15 @@ from lsvision.io import (
     product_writer,
     read_calibration,
     read_encoder,
+    read_line_motion,
     read_product,
     read_rig,
     read_scan,
     scan_sha256,
     write_encoder,
+    write_line_motion,
 )
-from lsvision.types import ProductGrid, ProductStrip
+from lsvision.types import LineMotion, ProductGrid, ProductStrip
 from tests.archive.archives import make_calibration, make_scan
 from tests.io.formats.test_mutated import mutated
 
@@ -113,7 +115,9 @@ def targets(root: Path) -> dict[str, Target]:
     made = product(root / "p.zarr")
     log, scan = root / "encoder.csv", make_scan(root / "scan", LINES)
     write_encoder(torch.arange(20.0).double(), log)
-    calibration = make_calibration(root / "calibration.json")
+    calibration, motion = make_calibration(root / "calibration.json"), root / "motion.parquet"
+    values = 0.1 * torch.rand(LINES, 4, dtype=torch.float64)
+    write_line_motion(LineMotion(values, torch.diag_embed(values.square())), motion)
 
     def use_product() -> None:
         check_product(made)
@@ -130,6 +134,7 @@ def targets(root: Path) -> dict[str, Target]:
         "encoder": Target(log, lambda: read_encoder(log, 20, line_pitch_mm=1.0)),
         "repaired": Target(log, lambda: read_encoder(log, 20, line_pitch_mm=1.0, repair=True)),
         "calibration": Target(calibration, lambda: read_calibration(calibration)),
+        "line motion": Target(motion, lambda: read_line_motion(motion, LINES)),
     }
     kinds = {
         "plain": as_tiff(), "deflate": as_tiff(compression="zlib", rowsperstrip=8), "lzw": as_tiff(compression="lzw"),

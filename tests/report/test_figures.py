@@ -16,6 +16,14 @@ from lsvision.report.calibration_figures import (
 )
 from lsvision.report.drawing import new_figure, show_image, thinned
 from lsvision.report.embedding import embed
+from lsvision.report.line_motion_figures import (
+    LineMotionView,
+    Profiles,
+    line_motion_figures,
+    motion_by_line,
+    motion_spectrum,
+    profiles_before_and_after,
+)
 from lsvision.report.product_figures import SheetView, height_profile, product_images, sheet_correspondences
 from lsvision.report.space_figures import corners_in_space, surface_in_space
 
@@ -45,6 +53,8 @@ def figures(determined, dominated, corners):
         surface_in_space("surface", height, 0.5, (10.0, -20.0)),
         surface_in_space("nothing", torch.full((4, 5), torch.nan), 0.5, (10.0, -20.0)),
         sheet_correspondences(SheetView(image, points, moved), SheetView(image, points, points), 0.5),
+        *line_motion_figures(LineMotionView(torch.rand(300, 4), torch.rand(300, 4), 0.5, (20.0, 80.0))),
+        profiles_before_and_after(*(Profiles(torch.arange(40.0), torch.rand(9, 40)) for _ in range(2))),
     ]
 
 
@@ -136,3 +146,37 @@ def test_embedded_as_vector_pixels_or_views(tmp_path, figures):
     assert sorted(path.name for path in tmp_path.iterdir()) == [
         f"{name}.{kind}" for name in ("drawing", "picture", "solid") for kind in ("png", "svg")
     ]
+
+
+def shaken(lines: int) -> LineMotionView:
+    """A sine of 0.3 mm over 25 mm in depth and one of 2 mrad over 40 mm in roll, on lines 0.5 mm apart."""
+    along = 0.5 * torch.arange(lines).double()
+    values, sigma = torch.zeros(lines, 4).double(), torch.full((lines, 4), 0.01).double()
+    values[:, 1] = 0.3 * torch.sin(2 * torch.pi * along / 25)
+    values[:, 2] = 2e-3 * torch.sin(2 * torch.pi * along / 40)
+    return LineMotionView(values, sigma, 0.5)
+
+
+def test_only_what_moves_is_drawn_and_roll_in_degrees():
+    depth, roll = motion_by_line(shaken(400)).figure.axes
+    assert depth.get_ylabel() == "displacement [mm]"
+    assert roll.get_ylabel() == "displacement [deg]"
+    line, band = roll.lines[0], roll.collections[0].get_paths()[0].vertices[:, 1]
+    assert max(line.get_ydata()) == pytest.approx(0.1146, rel=1e-3)
+    assert band.max() == pytest.approx(0.1146 + 2 * 0.573, rel=1e-3)
+    assert line_motion_figures(LineMotionView(torch.zeros(9, 4), torch.zeros(9, 4), 0.5)) == []
+
+
+def test_a_long_scan_shows_its_beginning_and_says_so():
+    figure = motion_by_line(shaken(5000))
+    assert len(figure.figure.axes[0].lines[0].get_xdata()) == 4000
+    assert "The first 4000 of 5000 lines" in figure.caption
+
+
+def test_a_spectrum_peaks_at_amplitude_and_wavelength():
+    figure = motion_spectrum(shaken(4000))
+    for axes, wavelength, amplitude in zip(figure.figure.axes, (25.0, 40.0), (0.3, 0.1146), strict=True):
+        x, y = axes.lines[0].get_data()
+        assert max(y) == pytest.approx(amplitude, rel=0.01)
+        assert x[y.argmax()] == pytest.approx(wavelength, rel=0.01)
+    assert "corrugation" not in figure.caption

@@ -26,8 +26,8 @@ class Residuals:
     """What fits have left of square windows, ``pixels = size²``, and how their corners follow from the pixels.
 
     The residual is orthogonal to the ``jacobian``, the derivative of the window by the parameters, of which the first
-    two are the corner; all are 0 at pixels that are not fitted, where the ``weight`` is 0. ``influence`` is the shift of
-    the corner by the noise of each pixel, ``corner`` is (u, v) from the middle of the window, px.
+    two are the corner; all are 0 at pixels that are not fitted, where the ``weight`` is 0. ``influence`` is the shift
+    of the corner by the noise of each pixel, ``corner`` is (u, v) from the middle of the window, px.
     """
 
     residual: Float[Tensor, "fits pixels"]
@@ -173,7 +173,7 @@ def corner_covariance(
     edge and cancel, but for about one pixel's at either end of the window: that share of their variance remains.
 
     Args:
-        first, second: fits of the same corners in windows of one size; both the same for the covariance within an image.
+        first, second: fits of the same corners in windows of one size; the same for the covariance within an image.
         strength: variance of each kind of noise.
     """
     remaining = strength.clone()

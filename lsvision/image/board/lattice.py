@@ -144,20 +144,6 @@ def _as_even(saddles: SaddlePoints, evenness: Tensor) -> Tensor:
     return (share > _EVEN[0]) & (share < _EVEN[1])
 
 
-def largest_patch(node: Int[Tensor, "corners 2"]) -> Bool[Tensor, " corners"]:
-    """Nodes of the largest patch that is linked by steps from a node to one of its four neighbours."""
-    if not len(node):
-        return torch.zeros(0, dtype=torch.bool)
-    apart = (node[:, None] - node[None]).abs().sum(-1)
-    patch = torch.arange(len(node))
-    while True:
-        # Every patch takes the smallest number in it; of two saddles on one node both belong to it.
-        smallest = torch.where(apart <= 1, patch, len(node)).amin(-1)
-        if torch.equal(smallest, patch):
-            return patch == patch.mode().values
-        patch = smallest
-
-
 def grow_lattice(saddles: SaddlePoints, seed: int) -> Lattice | None:
     """The lattice around one saddle, fitted to the saddles of ever wider surroundings; None where there is none."""
     offset = saddles.points - saddles.points[seed]

@@ -36,17 +36,20 @@ def like_the_board(fit: SaddleFit, valid: Bool[Tensor, " corners"]) -> Bool[Tens
 
 
 def evenly_clipped(
-    windows: Float[Tensor, "corners size size"],
+    brightest: Float[Tensor, "corners size size"],
     mask: Bool[Tensor, "corners size size"],
     valid: Bool[Tensor, " corners"],
 ) -> Bool[Tensor, " corners"]:
     """Valid corners whose windows have no more pixels at the end of the sensor's range than the board's median.
 
     Where white squares are clipped evenly the corners stay where they are; at the rim of glare they move.
+
+    Args:
+        brightest: the largest of each pixel's colours, of which any may be clipped alone.
     """
-    brightest = float(windows[valid].max()) if bool(valid.any()) else 0.0
-    end = 2 ** max(8, int(brightest).bit_length()) - 1
-    share = (mask & (windows >= _CLIPPED_LEVEL * end)).sum((1, 2)) / mask.sum((1, 2))
+    most = float(brightest[valid].max()) if bool(valid.any()) else 0.0
+    end = 2 ** max(8, int(most).bit_length()) - 1
+    share = (mask & (brightest >= _CLIPPED_LEVEL * end)).sum((1, 2)) / mask.sum((1, 2))
     return valid & ((share <= _CLIPPED_APART) | ((share - _median(share, valid)).abs() <= _CLIPPED_APART))
 
 
@@ -55,42 +58,53 @@ def in_line_with_neighbours(
 ) -> Bool[Tensor, " corners"]:
     """Valid corners that lie where their neighbours on the board expect them.
 
-    Each is compared with the median of what pairs of neighbours say, on both of its sides or on one. What is too far
-    follows from the board itself: under vibration all corners are out of line. It moves whole lines of the scan, and
-    with them whole rows of a board: a corner stays where neighbours along one axis, which tell as much as all, expect
-    it, and one that is between neighbours along one axis only may be out of line by as much as those beside it.
+    Each is compared with the median of what pairs of neighbours say: those on both of its sides where it has such, as
+    at a corner of the board, or beside hidden ones, it can only be extrapolated. What is too far follows from how far
+    the same makes the board's other corners: under vibration or uneven travel all are out of line. A vibration moves
+    whole lines of the scan, and with them whole rows of a board: a corner stays where neighbours along one axis, which
+    tell as much as all, expect it, and one between neighbours along one axis only may be as far off as those beside it.
     """
     if int(valid.sum()) < _FEWEST_IN_LINE:
         return valid
     seen = valid.reshape(grid.shape[:2])
     node = torch.stack(torch.meshgrid(*(torch.arange(n).to(grid) for n in grid.shape[:2]), indexing="ij"), dim=-1)
     bent = grid - QuadraticMap.fitted(node[seen], grid[seen])(node)
-    apart = _apart(torch.where(seen[..., None], bent, torch.nan))
-    known, spread, limit = apart.isfinite(), _spread(apart), _limit(apart)
-    far_beside = _too_far(torch.stack([apart[1] - _beside(apart[1], _ALONG_Y), apart[2] - _beside(apart[2], _ALONG_X)]))
-    wrong = _too_far(apart)[0]
-    for axis, other in ((1, 2), (2, 1)):
-        agrees = (apart[axis].abs() <= _AGREES * limit[axis]) & (spread[axis] < _TELLS * spread[0])
-        wrong = wrong & ~agrees
-        wrong = torch.where(known[axis] & ~known[other], far_beside[axis - 1], wrong)
-    return valid & ~wrong.any(-1).flatten()
+    bent = torch.where(seen[..., None], bent, torch.nan)
+    between, beyond = (bent - said for said in _said_by_neighbours(bent))
+    _, by_x, by_y = between
+    by_beside = _is_far(torch.stack([by_x - _beside(by_x, _ALONG_Y), by_y - _beside(by_y, _ALONG_X)]))
+    only_x, only_y = by_y.isnan() & by_x.isfinite(), by_x.isnan() & by_y.isfinite()
+    far = torch.where(between[0].isfinite(), _is_out_of_line(between), _is_out_of_line(beyond))
+    by_beside = by_beside & _is_far(between)[0]
+    far = torch.where(only_x, by_beside[0], torch.where(only_y, by_beside[1], far))
+    return valid & ~far.any(-1).flatten()
 
 
-def _apart(bent: Float[Tensor, "rows columns 2"]) -> Float[Tensor, "3 rows columns 2"]:
-    """How far each place is from the median of what all its neighbours, those along X and those along Y say.
+def _said_by_neighbours(bent: Float[Tensor, "rows columns 2"]) -> tuple[Tensor, Tensor]:
+    """Where neighbours put each place: those on both of its sides, ``(3, rows, columns, 2)``, those on one of them.
 
-    NaN where it is between none of them: a corner of the board itself could only be extrapolated, and uneven travel
-    would look like an error.
+    Medians of what all, those along X and those along Y say; NaN where such neighbours are missing.
     """
-    said, by_axis = [], []
+    said, between, beyond = [], [], []
     for axis in (_ALONG_X, _ALONG_Y):
         before_2, before, after, after_2 = (_shifted(bent, axis, step) for step in (-2, -1, 1, 2))
         said.append(torch.stack([(before + after) / 2, 2 * before - before_2, 2 * after - after_2]))
         complete = said[-1].isfinite().all(0)
-        by_axis.append(torch.where(complete, said[-1].median(0).values, said[-1][0]))
-    between = by_axis[0].isfinite() | by_axis[1].isfinite()
-    by_all = torch.where(between, torch.cat(said).nanmedian(0).values, torch.nan)
-    return bent - torch.stack([by_all, *by_axis])
+        between.append(torch.where(complete, said[-1].median(0).values, said[-1][0]))
+        beyond.append(said[-1][1:].nanmedian(0).values)
+    is_between = between[0].isfinite() | between[1].isfinite()
+    by_all = torch.where(is_between, torch.cat(said).nanmedian(0).values, torch.nan)
+    from_beyond = torch.cat([said[0][1:], said[1][1:]]).nanmedian(0).values
+    return torch.stack([by_all, *between]), torch.stack([from_beyond, *beyond])
+
+
+def _is_out_of_line(apart: Float[Tensor, "3 rows columns 2"]) -> Bool[Tensor, "rows columns 2"]:
+    """What is far from where all neighbours expect it, and not about where those along one axis do."""
+    spread, limit, wrong = _spread(apart), _limit(apart), _is_far(apart)[0]
+    for axis in (1, 2):
+        agrees = (apart[axis].abs() <= _AGREES * limit[axis]) & (spread[axis] < _TELLS * spread[0])
+        wrong = wrong & ~agrees
+    return wrong
 
 
 def _beside(values: Float[Tensor, "rows columns 2"], axis: tuple[int, int]) -> Float[Tensor, "rows columns 2"]:
@@ -110,12 +124,12 @@ def _spread(apart: Float[Tensor, "tests rows columns 2"]) -> Float[Tensor, "test
     return spread.nan_to_num(torch.inf)[:, None, None]
 
 
-def _too_far(apart: Float[Tensor, "tests rows columns 2"]) -> Bool[Tensor, "tests rows columns 2"]:
-    return apart.abs() > _limit(apart)
-
-
 def _limit(apart: Float[Tensor, "tests rows columns 2"]) -> Float[Tensor, "tests 1 1 2"]:
     return _OUT_OF_LINE_SPREADS * _spread(apart) + _OUT_OF_LINE_PX
+
+
+def _is_far(apart: Float[Tensor, "tests rows columns 2"]) -> Bool[Tensor, "tests rows columns 2"]:
+    return apart.abs() > _limit(apart)
 
 
 def _median(values: Tensor, valid: Tensor) -> Tensor:

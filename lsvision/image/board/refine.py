@@ -14,7 +14,7 @@ from lsvision.image.missing import missing_mask, missing_near
 from lsvision.types import LineImage, missing_ranges
 
 _READ_LINES = 512
-_MODEL_PX = 0.001  # a pixel's box is no Gaussian: the error that a sharp image without noise or texture leaves
+_MODEL_PX = 0.001  # the error that a sharp image without noise or texture leaves: a turned pixel is no box
 _INTO_SQUARES = 0.4  # share of a square that a window takes in: blur and shift stay clear of the next edges
 _FEWEST_PIXELS = 49  # of the squares in a window
 
@@ -90,12 +90,12 @@ def refine_grid(
     radius = steps.window_radius(largest_radius)
     centre = grid.reshape(-1, 2).round().long()
     inside = lies_within(image, centre, radius)
-    windows = read_windows(image, centre, inside, radius)
+    windows, brightest = read_windows(image, centre, inside, radius)
     mask = steps.within_squares(radius)
     fit = fit_saddles(windows, steps.normal_angles().to(windows), mask, SaddleOptions(plain=plain))
     valid = like_the_board(fit, fit.valid & inside)
     if not plain:
-        valid = evenly_clipped(windows, mask, valid)
+        valid = evenly_clipped(brightest, mask, valid)
         valid = in_line_with_neighbours((centre + fit.position).reshape(grid.shape), valid)
     covariance = torch.full_like(fit.covariance, torch.nan)
     noise = None
@@ -120,10 +120,14 @@ def lies_within(image: LineImage, centre: Int[Tensor, "corners 2"], radius: int)
 
 def read_windows(
     image: LineImage, centre: Int[Tensor, "corners 2"], wanted: Bool[Tensor, " corners"], radius: int
-) -> Float[Tensor, "corners size size"]:
-    """Brightness in square windows around (column, line), float64; 0 where a window is not wanted."""
+) -> tuple[Float[Tensor, "corners size size"], Float[Tensor, "corners size size"]]:
+    """Brightness in square windows around (column, line), and the largest of their colours; float64.
+
+    0 where a window is not wanted.
+    """
     size = 2 * radius + 1
     windows = torch.zeros(centre.shape[0], size, size, dtype=torch.float64)
+    brightest = torch.zeros_like(windows)
     span = torch.arange(size) - radius
     first = centre[:, 1] - radius
     for start in range(0, image.shape[0], _READ_LINES):
@@ -133,5 +137,7 @@ def read_windows(
         strip = image.read(start, min(image.shape[0], start + _READ_LINES + size))
         rows = (centre[here, 1, None] + span - start)[:, :, None]
         columns = (centre[here, 0, None] + span)[:, None, :]
-        windows[here] = gray(strip[rows, columns]).to(torch.float64)
-    return windows
+        pixels = strip[rows, columns]
+        windows[here] = gray(pixels).to(torch.float64)
+        brightest[here] = pixels.amax(-1).to(torch.float64)
+    return windows, brightest

@@ -1,7 +1,7 @@
 """Sub-pixel position of checkerboard corners: a parametric fit of the blurred saddle by Levenberg-Marquardt."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import torch
@@ -100,10 +100,11 @@ def _fit_together(windows: Windows, angles: Tensor, options: SaddleOptions) -> S
     variance = fitted.cost / (windows.weight.sum(-1) - PARAMETERS).clamp(min=1)
     inverse_normal = NormalMatrix.of(fitted.jacobian).inverse()
     influence = inverse_normal[:, POSITION] @ fitted.jacobian
+    residuals = Residuals(fitted.residual, windows.weight, fitted.jacobian, influence, parameters.position)
     return SaddleFit(
         position=parameters.position,
         covariance=inverse_normal[:, POSITION, POSITION] * variance[:, None, None],
-        residuals=_without_other_shapes(windows, parameters, fitted, influence),
+        residuals=residuals if options.plain else _without_other_shapes(windows, parameters, residuals),
         blur_px=(parameters.blur.square() + PIXEL_VARIANCE).sqrt(),
         contrast=parameters.contrast.abs(),
         residual=variance.sqrt(),
@@ -111,9 +112,7 @@ def _fit_together(windows: Windows, angles: Tensor, options: SaddleOptions) -> S
     )
 
 
-def _without_other_shapes(
-    windows: Windows, parameters: SaddleParameters, fitted: Linearisation, influence: Tensor
-) -> Residuals:
+def _without_other_shapes(windows: Windows, parameters: SaddleParameters, fitted: Residuals) -> Residuals:
     """Residuals less the differences of real pictures from the model, which are no noise.
 
     They are not fitted with the corner: in sharp windows that would let noise move it further.
@@ -122,7 +121,7 @@ def _without_other_shapes(
     jacobian = torch.cat([fitted.jacobian, shapes], dim=1)
     amount = NormalMatrix.of(jacobian).inverse() @ (jacobian @ fitted.residual[..., None])
     residual = fitted.residual - (jacobian.mT @ amount)[..., 0]
-    return Residuals(residual, windows.weight, jacobian, influence, parameters.position)
+    return replace(fitted, residual=residual, jacobian=jacobian)
 
 
 def _start(windows: Windows, angles: Tensor) -> SaddleParameters:

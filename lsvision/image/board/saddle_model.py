@@ -89,8 +89,8 @@ PIXEL_VARIANCE = 1 / 12
 class BlurredEdge:
     """Unit edge through the corner at every pixel, and its derivatives.
 
-    Across an edge, a square pixel is the sum of two boxes, ``|cos|`` and ``|sin|`` of the normal's angle wide. The wider
-    one is integrated exactly, of the other its variance is added to the blur: with ``H' = erf``, the edge is
+    Across an edge, a square pixel is the sum of two boxes, ``|cos|`` and ``|sin|`` of the normal's angle wide. The
+    wider one is integrated exactly, of the other its variance is added to the blur: with ``H' = erf``, the edge is
     ``(H(d + w/2) - H(d - w/2)) / w``.
     """
 
@@ -102,8 +102,10 @@ class BlurredEdge:
     by_angle: Float[Tensor, "corners pixels"]
     """Derivative by the angle of the normal, 1/rad."""
     normal: Float[Tensor, "2 corners 1"]
-    scaled: Float[Tensor, "corners pixels"]
-    """Distance from the edge over the blur of lens and pixel."""
+    across: Float[Tensor, "corners pixels"]
+    """Distance from the edge, px."""
+    blur: Float[Tensor, "corners 1"]
+    """Of the lens, px."""
 
     @classmethod
     def through_corner(cls, u: Tensor, v: Tensor, angle: Tensor, blur: Tensor) -> "BlurredEdge":
@@ -126,12 +128,14 @@ class BlurredEdge:
             by_blur=by_total * (blur / total),
             by_angle=slope * along + by_width * width_by_angle,
             normal=torch.stack([cosine, sine]),
-            scaled=across / (blur.square() + PIXEL_VARIANCE).sqrt(),
+            across=across,
+            blur=blur,
         )
 
     def by_kurtosis(self) -> Float[Tensor, "corners pixels"]:
         """Change of the value where the blur has other tails than a bell: the next term of Edgeworth's series."""
-        return self.scaled * (self.scaled.square() - 3) * torch.exp(-self.scaled.square() / 2)
+        scaled = self.across / (self.blur.square() + PIXEL_VARIANCE).sqrt()
+        return scaled * (scaled.square() - 3) * torch.exp(-scaled.square() / 2)
 
 
 def _erf_and_bell(distance: Tensor, blur: Tensor) -> tuple[Tensor, Tensor]:

@@ -13,6 +13,7 @@ from lsvision.errors import FileFormatError
 from lsvision.geometry import zero_disparity_mm
 from lsvision.io.atomic import partial_folder, write_text
 from lsvision.io.formats.encoder import read_encoder_log, write_encoder
+from lsvision.io.formats.line_motion import read_line_motion, write_line_motion
 from lsvision.io.formats.rig import read_rig, write_rig
 from lsvision.io.formats.validation import named_file, read_entries, read_yaml
 from lsvision.io.images.depth_map import PlausibleDepth
@@ -20,13 +21,13 @@ from lsvision.io.images.line_image import open_line_image
 from lsvision.io.images.tiff import write_line_image
 from lsvision.io.json_file import write_json
 from lsvision.schema import Checked, Positive, Says, Text
-from lsvision.types import DepthView, LineImage, MissingLines, Rig, Scan, StereoPair, Transport, Travel
+from lsvision.types import DepthView, LineImage, LineMotion, MissingLines, Rig, Scan, StereoPair, Transport, Travel
 
 ScanFormat = Literal["lsvision-scan/1"]
 SCAN_FORMAT: ScanFormat = "lsvision-scan/1"
 SCAN_FILE = "scan.yaml"
 # Entries that name a file or folder of the scan.
-FILE_KEYS = ("rig", "left", "right", "depth", "encoder")
+FILE_KEYS = ("rig", "left", "right", "depth", "encoder", "line_motion")
 IMAGE_KEYS = ("left", "right", "depth")
 
 
@@ -41,6 +42,7 @@ class ScanEntries(Checked):
     right: Text | None = None
     depth: Text | None = None
     encoder: Text | None = None
+    line_motion: Text | None = None
     transport: Transport | None = None
     color_registered: bool | None = None
     attributes: dict[str, Annotated[str | int | float, Says("text or a finite number")]] | None = None
@@ -55,7 +57,7 @@ class NewScan:
     none. ``extra_json`` is plain data by file name, written beside the scan ("truth.json").
 
     Raises:
-        ValueError: not exactly one of right and depth, or an encoder log of another length.
+        ValueError: not exactly one of right and depth, or a log of another length.
     """
 
     rig: Rig
@@ -68,6 +70,7 @@ class NewScan:
     dtype: torch.dtype = torch.uint8
     attributes: Mapping[str, str] = field(default_factory=dict)
     color_registered: bool = True
+    line_motion: LineMotion | None = None
     extra_json: Mapping[str, dict] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -76,6 +79,8 @@ class NewScan:
         positions_mm = self.travel.positions_mm
         if positions_mm is not None and len(positions_mm) != self.lines:
             raise ValueError(f"travel.positions_mm: expected {self.lines} positions, got {len(positions_mm)}")
+        if self.line_motion is not None and self.line_motion.lines != self.lines:
+            raise ValueError(f"line_motion: expected {self.lines} lines, got {self.line_motion.lines}")
 
     def entries(self) -> ScanEntries:
         """What ``scan.yaml`` says; an entry at its default is None."""
@@ -87,6 +92,7 @@ class NewScan:
             right=None if self.right is None else "right.tif",
             depth=None if self.depth is None else "depth.tif",
             encoder=None if self.travel.positions_mm is None else "encoder.csv",
+            line_motion=None if self.line_motion is None else "motion.parquet",
             transport=None if self.travel.transport == "forward" else self.travel.transport,
             color_registered=None if self.color_registered else False,
             attributes={name: str(value) for name, value in self.attributes.items()} or None,
@@ -119,18 +125,21 @@ def read_scan(path: Path | str, *, repair_encoder: bool = False, missing_lines: 
     pitch = entries.line_pitch_mm
     log = files.get("encoder")
     read = read_encoder_log(log, left.shape[0], line_pitch_mm=pitch, repair=repair_encoder) if log else None
+    travel = Travel(
+        pitch,
+        read.positions_mm if read else None,
+        entries.transport or "forward",
+        sigma_mm=read.sigma_mm if read else None,
+    )
+    shaken = files.get("line_motion")
     return Scan(
         path=file.parent,
         rig=rig,
-        travel=Travel(
-            pitch,
-            read.positions_mm if read else None,
-            entries.transport or "forward",
-            sigma_mm=read.sigma_mm if read else None,
-        ),
+        travel=travel,
         images=StereoPair(left, images["right"]) if "right" in images else DepthView(left, images["depth"]),
         color_registered=entries.color_registered is not False,
         attributes={name: str(value) for name, value in (entries.attributes or {}).items()},
+        line_motion=read_line_motion(shaken, left.shape[0], travel) if shaken else None,
     )
 
 
@@ -171,6 +180,8 @@ def write_scan(folder: Path | str, scan: NewScan) -> None:
             write_line_image(partial / "depth.tif", scan.depth, (scan.lines, scan.rig.width_px, 1), torch.float32)
         if scan.travel.positions_mm is not None:
             write_encoder(scan.travel.positions_mm, partial / "encoder.csv")
+        if scan.line_motion is not None:
+            write_line_motion(scan.line_motion, partial / "motion.parquet")
         for name, content in scan.extra_json.items():
             write_json(partial / name, content, strict=True)
         entries = {key: value for key, value in asdict(scan.entries()).items() if value is not None}

@@ -1,5 +1,6 @@
 """Reading plain data: every entry is checked, and every error names the file and the key."""
 
+import io
 import json
 import stat
 from collections.abc import Mapping
@@ -20,14 +21,14 @@ Triple = tuple[float, float, float]
 Matrix = tuple[Triple, Triple, Triple]
 
 
-def read_text(path: Path, most_bytes: int = _MOST_BYTES) -> str:
-    """Text of a UTF-8 file.
+def read_bytes(path: Path, most_bytes: int = _MOST_BYTES) -> bytes:
+    """Content of a file.
 
     Args:
         most_bytes: size of the largest file that is read.
 
     Raises:
-        FileFormatError: there is no such file, or it is not text, too large, a device or a pipe.
+        FileFormatError: there is no such file, or it is too large, a device or a pipe.
     """
     try:
         state = path.stat()
@@ -35,15 +36,28 @@ def read_text(path: Path, most_bytes: int = _MOST_BYTES) -> str:
             raise FileFormatError(path, "expected a file, got a folder, device or pipe")
         if state.st_size > most_bytes:
             raise FileFormatError(path, f"expected at most {most_bytes} bytes, got {state.st_size}")
-        return path.read_text(encoding="utf-8")
+        return path.read_bytes()
     except FileNotFoundError:
         raise FileFormatError(path, "no such file") from None
-    except UnicodeDecodeError as error:
-        raise FileFormatError(path, f"cannot be read as text: no UTF-8 at byte {error.start}") from error
     except OSError as error:
         raise FileFormatError(path, f"cannot be read: {error.strerror}") from error
     except ValueError as error:  # a null character in the name
         raise FileFormatError(path, f"cannot be read: {error}") from error
+
+
+def read_text(path: Path, most_bytes: int = _MOST_BYTES) -> str:
+    """Text of a UTF-8 file.
+
+    Args:
+        most_bytes: size of the largest file that is read.
+
+    Raises:
+        FileFormatError: as ``read_bytes``, or it is not text.
+    """
+    try:
+        return io.TextIOWrapper(io.BytesIO(read_bytes(path, most_bytes)), encoding="utf-8").read()
+    except UnicodeDecodeError as error:
+        raise FileFormatError(path, f"cannot be read as text: no UTF-8 at byte {error.start}") from error
 
 
 def read_yaml(path: Path) -> object:

@@ -10,6 +10,7 @@ import zarr
 from lsvision.errors import FileFormatError, LsvisionError
 from lsvision.io.images.chunk_size import check_chunk_count, check_chunks
 from lsvision.io.product.layout import image_names
+from lsvision.io.product.line_motion import check_line_motion
 from lsvision.io.product.measured import MeasuredCells
 from lsvision.io.product.pyramid import level_shape, multiscales
 from lsvision.io.product.reader import Product, read_product
@@ -50,6 +51,7 @@ def _check(product: Product) -> ProductCheck:
         levels = _check_metadata(product, name, root[name])
         for level in range(levels):
             _check_level(product, f"{name}/{level}", root[f"{name}/{level}"], level_shape(product.shape, level))
+    check_line_motion(product.path, root, product.has_line_motion)
     measured = _check_cells(product, chunk_rows=root["height/0"].chunks[0])
     rows, columns = product.shape
     share = measured.count / (rows * columns)

@@ -1,6 +1,7 @@
 """The layout of a product: an OME-Zarr group of images, each a pyramid over the same grid of cells.
 
-``color``, ``height``, ``valid`` and ``source``, and ``sigma`` where it was asked for. A chunk holds the rows of a strip
+``color``, ``height``, ``valid`` and ``source``, and ``sigma`` where it was asked for; beside them the group
+``line_motion`` where that was corrected. A chunk holds the rows of a strip
 over all columns, at every level of the pyramid, so that strips never share a chunk; each chunk carries a checksum that
 every reader verifies.
 
@@ -21,8 +22,9 @@ from zarr.codecs import BloscCodec, Crc32cCodec, ZstdCodec
 from lsvision.io.images.bands import NUMPY_DTYPES
 from lsvision.io.images.tiff import ZSTD_LEVEL
 from lsvision.io.json_file import finite_or_null
+from lsvision.io.product.line_motion import create_line_motion
 from lsvision.io.product.pyramid import level_count, level_shape, multiscales
-from lsvision.types import ProductGrid, ProductStrip
+from lsvision.types import LineMotion, ProductGrid, ProductStrip
 
 PRODUCT_FORMAT = "lsvision-product/1"
 ROOT_METADATA = "zarr.json"
@@ -40,6 +42,7 @@ class ProductLayout:
     ``channels`` (1 or 3) and ``dtype`` (uint8 or uint16) are those of the colour image. A chunk holds ``chunk_rows``
     rows and all columns. ``metadata`` is plain data kept with the product. With ``uncertainty`` the product also holds
     the standard deviations of its positions. ``source_dtype`` is that of the positions in the scan.
+    ``line_motion`` is what the scan was corrected for besides n.
     """
 
     grid: ProductGrid
@@ -49,6 +52,7 @@ class ProductLayout:
     metadata: Mapping[str, object]
     uncertainty: bool = False
     source_dtype: torch.dtype = torch.float32
+    line_motion: LineMotion | None = None
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -72,6 +76,8 @@ def create_images(folder: Path | str, layout: ProductLayout) -> None:
     _create_image(root, layout, "source", source, np.nan, 2)
     if layout.uncertainty:
         _create_image(root, layout, "sigma", np.float32, np.nan, 3)
+    if layout.line_motion is not None:
+        create_line_motion(root, layout.line_motion)
 
 
 def image_names(root: Any) -> list[str]:

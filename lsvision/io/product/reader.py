@@ -4,7 +4,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -15,6 +15,7 @@ from torch import Tensor
 from lsvision.errors import FileFormatError
 from lsvision.io.images.chunk_size import check_chunks
 from lsvision.io.product.layout import FULL_LEVEL, PRODUCT_FORMAT, image_names
+from lsvision.io.product.line_motion import read_columns
 from lsvision.schema import shown
 from lsvision.types import ProductGrid, ProductStrip
 
@@ -48,6 +49,21 @@ class Product:
     def has_sigma(self) -> bool:
         """Whether the product holds the standard deviations of its positions."""
         return (self.path / "sigma").is_dir()
+
+    @property
+    def line_motion_metadata(self) -> Mapping[str, Any]:
+        """What the product says about the motion from line to line; empty where it says nothing."""
+        entry = self.metadata.get("line_motion")
+        return entry if isinstance(entry, Mapping) else {}
+
+    @property
+    def has_line_motion(self) -> bool:
+        """Whether the product says that a motion from line to line was looked for or given."""
+        return str(self.line_motion_metadata.get("source", "none")) != "none"
+
+    def line_motion(self) -> dict[str, Float[Tensor, " lines"]]:
+        """Motion from line to line by name (``dx_mm``, ``dx_sigma_mm``, ..), of products that were corrected for it."""
+        return read_columns(zarr.open_group(self.path, mode="r"))
 
     def read(self, start: int, stop: int) -> ProductStrip:
         """Rows ``start..stop-1`` of every image."""

@@ -85,6 +85,22 @@ def test_a_vibration_that_moves_whole_rows_costs_no_corner(yaw):
         assert in_line_with_neighbours(grid, ALL).all()
 
 
+def test_a_wrong_corner_beside_a_hidden_one_at_the_rim():
+    grid, valid = curved_grid(), ALL.clone()
+    valid[5] = False
+    grid[0, 6] += 3.0
+    kept = in_line_with_neighbours(grid, valid)
+    assert not kept[6]
+    assert int(kept.sum()) == 86
+
+
+@pytest.mark.parametrize("corner", [0, 10, 77, 87])
+def test_a_corner_of_the_board_itself(corner):
+    grid = curved_grid()
+    grid[corner // 11, corner % 11, 0] += 3.0
+    assert in_line_with_neighbours(grid, ALL).logical_not().nonzero().tolist() == [[corner]]
+
+
 def test_missing_neighbours_cost_no_corner():
     valid = torch.rand(88) > 0.4
     grid = torch.where(valid.reshape(8, 11, 1), curved_grid(), torch.nan)

@@ -18,10 +18,20 @@ def test_windows_are_slices_of_the_image():
     centre = torch.tensor([[10, 8], [30, 510], [31, 513], [50, 1024], [3, 100], [30, 1297]])
     inside = lies_within(TensorImage(image), centre, 5)
     assert inside.tolist() == [True, True, True, True, False, False]
-    windows = read_windows(TensorImage(image), centre, inside, 5)
+    windows, brightest = read_windows(TensorImage(image), centre, inside, 5)
+    assert torch.equal(brightest, windows)
     for window, (u, v), seen in zip(windows, centre.tolist(), inside.tolist(), strict=True):
         expected = image[v - 5 : v + 6, u - 5 : u + 6, 0].double() if seen else torch.zeros(11, 11).double()
         assert torch.equal(window, expected)
+
+
+def test_the_brightest_colour_of_each_pixel():
+    image = torch.randint(0, 200, (30, 30, 3)).to(torch.uint8)
+    image[12, 13, 0] = 255
+    centre, inside = torch.tensor([[15, 15]]), torch.ones(1, dtype=torch.bool)
+    windows, brightest = read_windows(TensorImage(image), centre, inside, 5)
+    assert torch.equal(brightest[0], image[10:21, 10:21].amax(-1).double())
+    assert brightest[0, 2, 3] == 255 > windows[0, 2, 3]
 
 
 def test_steps_of_a_square_grid():

@@ -30,6 +30,27 @@ def test_position_is_recovered_without_noise(corners):
     torch.testing.assert_close(fit.contrast, torch.full_like(blur, 90.0), rtol=0, atol=0.5)
 
 
+@pytest.mark.parametrize("angle", [0.0, 0.01, 0.3])
+def test_sharp_edges_along_the_pixels_lock_no_corner_to_them(angle):
+    # Each pixel is the mean over its square: windows of fine pixels, 25 x 25 to a pixel.
+    fine = 25
+    axis = (torch.arange(SIZE * fine, dtype=torch.float64) + 0.5) / fine - 0.5 - SIZE // 2
+    v, u = torch.meshgrid(axis, axis, indexing="ij")
+    position = torch.cat([torch.tensor([[0.25, -0.25], [0.1, 0.35]]).double(), torch.rand(10, 2).double() - 0.5])
+    angles = torch.tensor([angle, angle + math.pi / 2]).double().expand(len(position), 2)
+    edges = [
+        torch.sign((u - at[0]) * math.cos(a) + (v - at[1]) * math.sin(a))
+        for at in position
+        for a in (angle, angle + math.pi / 2)
+    ]
+    pictures = torch.stack([120 + 90 * one * other for one, other in zip(edges[::2], edges[1::2], strict=True)])
+    windows = torch.nn.functional.avg_pool2d(pictures, fine)
+    fit = fit_saddles(windows + torch.randn_like(windows), angles)
+    assert fit.valid.all()
+    # Fine pixels place an edge along them to a fiftieth of a pixel.
+    assert (fit.position - position).abs().max() < 0.025
+
+
 def test_a_plain_fit_is_near_the_full_one(corners):
     position, angles, blur = corners
     fit = fit_saddles(saddle_windows(position, angles, blur), angles, options=SaddleOptions(plain=True))

@@ -11,7 +11,7 @@ from lsvision.image.board.saddle_model import FULL, PLAIN, BlurredEdge, Saddle, 
 
 
 def plain_formula(columns: Tensor, grid: Tensor) -> Tensor:
-    """Grey values (pixels) of one saddle of 17 parameters, as the model's docstrings write them; boxes by quadrature."""
+    """Grey values (pixels) of one saddle of 17 parameters, as the docstrings write them; boxes by quadrature."""
     u0, v0, angle_1, angle_2, blur = columns[:5]
     u, v = grid
     node, weight = (torch.from_numpy(part) / 2 for part in np.polynomial.legendre.leggauss(40))
@@ -41,9 +41,9 @@ def grid() -> Tensor:
 
 
 def test_values_by_hand():
-    # Sharp edges along the axes, contrast 10 on 50 with slope 2 along u. The first pixel lies a quarter of a pixel right
-    # of one edge and a tenth below the other: three quarters less one quarter of it are bright, six tenths less four.
-    # Right of the first edge lies another 4, more of it further down.
+    # Sharp edges along the axes, contrast 10 on 50 with slope 2 along u. The first pixel lies a quarter of a pixel
+    # right of one edge and a tenth below the other: three quarters less one quarter of it are bright, six tenths less
+    # four. Right of the first edge lies another 4, more of it further down.
     parameters = torch.tensor([[0.5, -0.25, 0.0, math.pi / 2, 1e-4, 50, 2, 0, 4, 0, 1, 0, 0, 0, 10, 0, 0]]).double()
     grid = torch.tensor([[0.75, 0.5], [-0.15, -0.25]]).double()
     values = Saddle.on_grid(SaddleParameters(parameters), grid).values()
