@@ -1,4 +1,4 @@
-"""Library API: Rauch-Tung-Striebel cubature smoother in square-root form.
+"""Rauch-Tung-Striebel cubature smoother in square-root form.
 
 Backwards from the last filtered state, with the moments of the transition f over the filtered Gaussian N(m, L Lᵀ):
 

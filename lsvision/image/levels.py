@@ -51,9 +51,11 @@ class CameraLevels:
         faulty = _faulty_columns(sampled, white)
         if not image.dtype.is_floating_point:
             codes = sampled[:, ~faulty, _deciding_channel(sampled)].flatten().to(torch.int64)
-            highest = int(codes.kthvalue(max(1, len(codes) - int(_HOT_SHARE * len(codes)))).values) if len(codes) else 0
-            plateau = highest if _is_plateau(codes, highest) else torch.iinfo(image.dtype).max
-            return cls(plateau, _top_codes(image.dtype, codes, highest), faulty)
+            counts = codes.bincount()
+            # The highest code but for the few of hot pixels.
+            highest = int((counts.cumsum(0) < len(codes) - int(_HOT_SHARE * len(codes))).sum())
+            plateau = highest if _is_plateau(counts, highest) else torch.iinfo(image.dtype).max
+            return cls(plateau, _top_codes(image.dtype, highest), faulty)
         return cls(_NO_CODE, (), faulty)
 
     def unusable(self, lines: Shaped[Tensor, "lines width channels"]) -> Bool[Tensor, "lines width"] | None:
@@ -87,14 +89,15 @@ def _deciding_channel(values: Shaped[Tensor, "lines width channels"]) -> int:
     return min(1, values.shape[-1] - 1)
 
 
-def _is_plateau(codes: Tensor, highest: int) -> bool:
-    """Whether samples pile up at the highest code, as they do where it stands for everything brighter."""
-    counts = torch.stack([(codes == highest - below).sum() for below in range(_PLATEAU_BELOW + 1)])
-    piled, below = float(counts[0]), float(counts[1:].max())
-    return piled >= _PLATEAU_SHARE * len(codes) and piled > _PLATEAU_RISE * below and below > 0
+def _is_plateau(counts: Tensor, highest: int) -> bool:
+    """Whether samples, counted by code, pile up at the highest one, as where it stands for everything brighter."""
+    if not 0 < highest < len(counts):
+        return False
+    piled, below = int(counts[highest]), int(counts[max(highest - _PLATEAU_BELOW, 0) : highest].max())
+    return piled >= _PLATEAU_SHARE * int(counts.sum()) and piled > _PLATEAU_RISE * below and below > 0
 
 
-def _top_codes(dtype: torch.dtype, codes: Tensor, highest: int) -> tuple[int, ...]:
+def _top_codes(dtype: torch.dtype, highest: int) -> tuple[int, ...]:
     """The largest codes of sensors whose range holds the highest of some codes, right- or left-aligned."""
     if dtype == torch.uint8:
         return ()
@@ -111,10 +114,16 @@ def _faulty_columns(sampled: Float[Tensor, "lines width channels"], white: float
     ranges = values.amax(0) - values.amin(0)
     usual_range = _usual(ranges)
     stuck = (ranges <= _STUCK * usual_range) & (usual_range >= _LEAST_RANGE) & _between(ranges > _LIVELY * usual_range)
-    steps = F.pad(values.diff(dim=1).abs().median(0).values, (1, 1), value=torch.inf)
+    steps = F.pad(_median_of_lines(values.diff(dim=1).abs()), (1, 1), value=torch.inf)
     difference = torch.minimum(steps[:-1], steps[1:])  # from the nearer neighbour
     wild = (difference > _WILD * _usual(difference, around=True)) & (difference > _LEAST_DIFFERENCE * white)
     return stuck | wild
+
+
+def _median_of_lines(values: Float[Tensor, "lines columns"]) -> Float[Tensor, " columns"]:
+    """The lower median of each column: NumPy's partition takes a quarter of the time of torch's median."""
+    middle = (len(values) - 1) // 2
+    return torch.from_numpy(np.partition(values.numpy(), middle, axis=0)[middle])
 
 
 def _between(marked: Bool[Tensor, " width"]) -> Bool[Tensor, " width"]:

@@ -57,20 +57,18 @@ def fill_from_background(disparity: Float[Tensor, "lines width"]) -> Float[Tenso
     Returns:
         None where no pixel has a disparity.
     """
-    valid = (disparity == disparity).numpy()  # not NaN
+    # Ends without a valid neighbour refer to a column of infinity on either side, so that no gap reaches another line.
+    padded = F.pad(disparity, (1, 1), value=torch.inf)
+    values = padded.view(-1).numpy()
+    valid = values == values  # not NaN
     if valid.all():
         return disparity
-    if not valid.any():
+    empty = ~torch.from_numpy(valid.reshape(padded.shape)[:, 1:-1].any(1))
+    if bool(empty.all()):
         return None
-    width = disparity.shape[1]
-    column = np.arange(width, dtype=np.int32)
-    before = np.maximum.accumulate(np.where(valid, column, -1), axis=1)
-    after = np.minimum.accumulate(np.where(valid, column, width)[:, ::-1], axis=1)[:, ::-1]
-    # Ends without a valid neighbour refer to a column of infinity on either side.
-    padded = F.pad(disparity, (1, 1), value=torch.inf)
-    left, right = (padded.gather(1, torch.from_numpy(end + np.int64(1))) for end in (before, after))
-    filled = torch.minimum(left, right)
-    empty = torch.from_numpy(~valid.any(1))
+    before, after = (np.flatnonzero(valid[:-1] > valid[1:]), np.flatnonzero(valid[:-1] < valid[1:]) + 1)
+    values[~valid] = np.repeat(np.minimum(values[before], values[after]), after - before - 1)
+    filled = padded[:, 1:-1].contiguous()
     if bool(empty.any()):
         filled[empty] = disparity.nanmedian()
     return filled

@@ -55,9 +55,9 @@ def matching_cost(
     return torch.where(disparity.isnan(), _NO_MATCH, cost)
 
 
-def stretches(marked: Bool[Tensor, " columns"]) -> list[slice]:
-    """Stretches of marked columns with room for a search on either side."""
-    wide = F.max_pool1d(marked.float()[None], 2 * _ROOM_PX + 1, 1, _ROOM_PX)[0]
+def stretches(marked: Bool[Tensor, " columns"], room: int = _ROOM_PX) -> list[slice]:
+    """Stretches of marked columns with room on either side, that of a search where not told."""
+    wide = F.max_pool1d(marked.float()[None], 2 * room + 1, 1, room)[0]
     bounds = F.pad(wide, (1, 1)).diff().nonzero()[:, 0].view(-1, 2)
     return [slice(start, stop) for start, stop in bounds.tolist()]
 

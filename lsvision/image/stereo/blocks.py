@@ -5,6 +5,9 @@ import torch
 from jaxtyping import Float, Shaped
 from torch import Tensor
 
+from lsvision.image.tiling import halo_ranges
+
+_ROWS_AT_ONCE = 32  # stay in the processor's cache, which halves the time
 _LARGEST_STEP_PX = 4.0  # an interpolated value that differs by more from that of its block mixes two surfaces
 
 
@@ -50,8 +53,13 @@ def enlarged(
     """
     if block == 1:
         return disparity
-    own = repeated(disparity, block)
-    size = own.shape[1], own.shape[0]
-    smooth = torch.from_numpy(cv2.resize(disparity.numpy(), size, interpolation=cv2.INTER_LINEAR))
-    # A comparison with NaN is false.
-    return torch.where((smooth - own).abs_() < largest_step_px, smooth, own)
+    result = disparity.new_empty(block * disparity.shape[0], block * disparity.shape[1])
+    for rows in halo_ranges(disparity.shape[0], _ROWS_AT_ONCE, 1):
+        part = disparity[rows.outer]
+        own = repeated(part, block)
+        smooth = torch.from_numpy(cv2.resize(part.numpy(), own.shape[::-1], interpolation=cv2.INTER_LINEAR))
+        # A comparison with NaN is false.
+        close = (smooth - own).abs_() < largest_step_px
+        inner = slice(block * rows.inner.start, block * rows.inner.stop)
+        torch.where(close[inner], smooth[inner], own[inner], out=result[block * rows.start : block * rows.stop])
+    return result

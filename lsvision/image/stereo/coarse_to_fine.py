@@ -124,7 +124,7 @@ def _search_half(
     around = _search_around(search)
     best.search_around(surfaces.near, doubtful, around)
     best.search_around(surfaces.far, two, around)
-    disparity = agreeing(_without_speckles(best.disparity, search.speckle_px), best.cost, check_px)
+    disparity = agreeing(without_speckles(best.disparity, search.speckle_px), best.cost, check_px)
     return _refined_where(half, disparity, doubtful, options)
 
 
@@ -144,6 +144,7 @@ def _search_around(search: Search) -> Search:
         left_right_check_px=high - low + 1,
         uniqueness_percent=0,
         speckle_px=0,
+        beyond_px=0,  # the surface is known, and 16 disparities cost half of 32
     )
 
 
@@ -156,7 +157,7 @@ def _grown(marked: Tensor) -> Tensor:
     return torch.from_numpy(cv2.dilate(dense, kernel)) > 0
 
 
-def _without_speckles(disparity: Tensor, size: int) -> Tensor:
+def without_speckles(disparity: Tensor, size: int) -> Tensor:
     """Disparity without patches of fewer pixels than ``size``; steps of more than a pixel separate patches."""
     steps, missing = 16, -32768
     scaled = torch.nan_to_num(steps * disparity, nan=missing).clamp(missing, -missing - 1).to(torch.int16)

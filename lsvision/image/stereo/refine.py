@@ -8,7 +8,7 @@ In the window around each block
 4. the variance of the residual and the texture give the step's sigma (``LeftWindows.certainty``).
 
 At the end implausible results are undone or dropped (``_accepted``), the scatter of the disparities joins the sigma
-(``with_scatter``), and blocks become pixels.
+(``with_scatter``).
 """
 
 import math
@@ -19,7 +19,7 @@ import torch.nn.functional as F  # noqa: N812
 from jaxtyping import Float, Shaped
 from torch import Tensor
 
-from lsvision.image.stereo.blocks import block_side, enlarged, repeated, whole_blocks
+from lsvision.image.stereo.blocks import block_side, enlarged, whole_blocks
 from lsvision.image.stereo.scatter import SigmaGains, with_scatter
 from lsvision.image.stereo.shift import Certainty, LeftWindows, explained_share
 from lsvision.image.stereo.texture import TextureSupport, texture_support
@@ -76,13 +76,13 @@ class RefineOptions:
 
 @dataclass(frozen=True)
 class RefinedDisparity:
-    """Disparity and its sigma, px, and the variance of the grey values that it leaves around each block.
+    """Of each block: disparity and its sigma, px, and the variance of the grey values that it leaves around the block.
 
     NaN where there is none.
     """
 
-    disparity: Float[Tensor, "lines width"]
-    sigma: Float[Tensor, "lines width"]
+    disparity: Float[Tensor, "rows columns"]
+    sigma: Float[Tensor, "rows columns"]
     residual_variance: Float[Tensor, "rows columns"]
 
 
@@ -106,28 +106,23 @@ def refine_disparity(
     photographs, whose residuals are mostly other light, other blur and surfaces that are no plane, it claims 2.6 times
     too little. The scatter is an error that has been seen.
 
-    A disparity for each 2 x 2 pixels, the last ones perhaps incomplete, is refined by all pixels of the images and
-    interpolated at the end: neighbouring windows share most of their pixels and add little information.
+    A disparity for each 2 x 2 pixels, the last ones perhaps incomplete, is refined by all pixels of the images;
+    ``enlarged`` gives that of each pixel: neighbouring windows share most of their pixels and add little information.
 
     Args:
         left, right: grey values of the pair; the left image may be a part of the right one's width.
         disparity: px of the images, one value for each pixel of the left one or for each block of 2 x 2.
         first_column: column of the right image at which the left one begins.
 
-    Returns:
-        Values for each pixel of the left image.
-
     Raises:
         ValueError: the disparity has neither one value for each pixel nor one for each block.
     """
-    block, (lines, width) = block_side(left, disparity), left.shape
+    block = block_side(left, disparity)
     window = options.window_blocks(block)
     reach = options.iterations + (1 if options.with_sigma else 0)
-    halo = 2 * reach * (window // 2) + block - 1  # interpolation reads one block further
+    halo = 2 * reach * (window // 2)
     gains = SigmaGains.of(window, options.iterations)
-    result = RefinedDisparity(
-        disparity.new_empty(lines, width), disparity.new_empty(lines, width), torch.full_like(disparity, torch.nan)
-    )
+    result = RefinedDisparity(*(torch.empty_like(disparity) for _ in range(3)))
 
     def refine_rows(rows: HaloRange) -> None:
         """Refine a row of tiles."""
@@ -136,7 +131,7 @@ def refine_disparity(
             start = disparity[rows.outer, columns.outer]
             pixels = slice(block * columns.outer_start, block * columns.outer_stop)
             refined = _refine_blocks(left_rows[:, pixels], right_rows, start, first_column + pixels.start, options)
-            _write_pixels(_accepted(refined, start, gains, options), block, (rows, columns), result)
+            _write(_accepted(refined, start, gains, options), (rows, columns), result)
 
     in_parallel(refine_rows, halo_ranges(disparity.shape[0], _TILE_LINES // block, halo))
     return result
@@ -213,20 +208,17 @@ def _accepted(refined: _Refined, start: Tensor, gains: SigmaGains, options: Refi
         dropped.logical_or_(~refined.support.proven)
         sigma = sigma.square_().add_(refined.support.variance).sqrt_()
     disparity.masked_fill_(dropped, torch.nan)
-    return RefinedDisparity(disparity, sigma, refined.certainty.residual_variance + (disparity - disparity))
+    missing = disparity - disparity  # NaN where there is none, else zero
+    return RefinedDisparity(disparity, sigma.add_(missing), refined.certainty.residual_variance + missing)
 
 
-def _write_pixels(
-    blocks: RefinedDisparity, block: int, ranges: tuple[HaloRange, HaloRange], result: RefinedDisparity
-) -> None:
-    """Write what blocks give for each of their pixels, without the halo, into the maps of the image."""
-    tile = tuple(slice(block * part.start, block * part.stop) for part in ranges)
-    disparity, sigma = result.disparity[tile], result.sigma[tile]
-    inner = tuple(
-        slice(block * part.inner.start, block * part.inner.start + size)  # the last blocks may be incomplete
-        for part, size in zip(ranges, disparity.shape, strict=True)
-    )
-    disparity.copy_(enlarged(blocks.disparity, block)[inner])
-    torch.add(disparity - disparity, repeated(blocks.sigma, block)[inner], out=sigma)  # NaN where the disparity is
+def _write(tile: RefinedDisparity, ranges: tuple[HaloRange, HaloRange], result: RefinedDisparity) -> None:
+    """Write the values of a tile, without its halo, into the maps."""
     own = tuple(slice(part.start, part.stop) for part in ranges)
-    result.residual_variance[own] = blocks.residual_variance[tuple(part.inner for part in ranges)]
+    inner = tuple(part.inner for part in ranges)
+    for target, values in (
+        (result.disparity, tile.disparity),
+        (result.sigma, tile.sigma),
+        (result.residual_variance, tile.residual_variance),
+    ):
+        target[own] = values[inner]

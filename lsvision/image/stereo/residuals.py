@@ -17,11 +17,11 @@ class Misfit:
     """How far residuals exceed noise.
 
     Attributes:
-        share: variance of the residuals over the usual one, in the map or in the surroundings, whichever is larger.
+        noise_variance: the usual variance of the residuals, of the map or of the surroundings, whichever is larger.
         factor: by which the variance of a disparity grows, 1 at least: residuals this large are no independent noise.
     """
 
-    share: Float[Tensor, "rows columns"]
+    noise_variance: Float[Tensor, "rows columns"]
     factor: Float[Tensor, "rows columns"]
 
     @classmethod
@@ -32,7 +32,7 @@ class Misfit:
         around = torch.fmax(_tile_medians(sampled), usual)
         side = _TILE // block
         around = around.repeat_interleave(side, 0)[: len(variance)].repeat_interleave(side, 1)[:, : variance.shape[1]]
-        return cls(variance / around, variance.div(_DISTURBED * usual).clamp_(min=1.0))
+        return cls(around, variance.div(_DISTURBED * usual).clamp_(min=1.0))
 
 
 def _tile_medians(sampled: Float[Tensor, "rows columns"]) -> Float[Tensor, "tile_rows tile_columns"]:

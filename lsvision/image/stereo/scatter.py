@@ -13,6 +13,9 @@ from torch import Tensor
 
 from lsvision.image.stereo.windows import Windows
 
+# Errors over those that the scatter of independent ones would mean, on rendered pairs and photographs: errors of the
+# search, which a step does not average away, scatter more than others.
+_SCATTERED = 0.9
 _STEP_PX = 0.8  # a larger deviation is that of another surface
 # The share of the predicted variance: it covers smooth ground, which matching holds where it was, right or wrong.
 _PREDICTED = 0.15
@@ -67,5 +70,5 @@ def with_scatter(
     """
     known = torch.nan_to_num(disparity)
     deviation = windows.mean(known).sub_(known).clamp_(-_STEP_PX, _STEP_PX)
-    variance = windows.mean(deviation.square_()).mul_(gains.scatter**2)
+    variance = windows.mean(deviation.square_()).mul_((_SCATTERED * gains.scatter) ** 2)
     return variance.addcmul_(predicted, predicted, value=_PREDICTED).add_(_INTERPOLATION_PX**2).sqrt_()

@@ -26,6 +26,7 @@ class Search:
         left_right_check_px: largest disagreement of the two views' disparities.
         uniqueness_percent: by how much the best match must beat the second best.
         speckle_px: smaller patches are removed, px; 0 keeps all.
+        beyond_px: disparities searched beyond either end of the range: what lies out there must not count as its end.
 
     Raises:
         ValueError: the range is empty.
@@ -39,6 +40,7 @@ class Search:
     left_right_check_px: int
     uniqueness_percent: int
     speckle_px: int
+    beyond_px: int = 1
 
     def __post_init__(self) -> None:
         if self.maximum_px <= self.minimum_px:
@@ -46,9 +48,10 @@ class Search:
 
     def matcher(self) -> cv2.StereoSGBM:
         """OpenCV's matcher; its range is extended to the multiple that it requires."""
-        count = self.maximum_px - self.minimum_px + 1
+        first, last = self.minimum_px - self.beyond_px, self.maximum_px + self.beyond_px
+        count = last - first + 1
         return cv2.StereoSGBM.create(
-            minDisparity=self.minimum_px,
+            minDisparity=first,
             numDisparities=count + -count % _COUNT_MULTIPLE,
             blockSize=self.block_size,
             P1=self.small_change_penalty,
@@ -112,8 +115,9 @@ def match_sgbm(pair: GrayPair, search: Search) -> Float[Tensor, "lines width"]:
     # Columns closer to the image's edge than the range have no partner for some disparities, and SGBM leaves them out.
     # A margin that repeats the edge gives them one.
     matcher, width = search.matcher(), pair.left.shape[1]
-    before = max(search.minimum_px + matcher.getNumDisparities(), 0)
-    after = max(-search.minimum_px + 1, 0)
+    first = matcher.getMinDisparity()
+    before = max(first + matcher.getNumDisparities(), 0)
+    after = max(-first + 1, 0)
     padded = (
         cv2.copyMakeBorder(image.numpy(), 0, 0, before, after, cv2.BORDER_REPLICATE)
         for image in (pair.left, pair.right)

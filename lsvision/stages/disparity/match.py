@@ -12,16 +12,18 @@ from lsvision.image.missing import missing_mask, missing_near
 from lsvision.image.stereo.agreement import occluded
 from lsvision.image.stereo.blocks import block_side, enlarged, repeated
 from lsvision.image.stereo.clipping import UnusableSamples, holes_factor
-from lsvision.image.stereo.coarse_to_fine import COARSEST, match_coarse_to_fine
+from lsvision.image.stereo.coarse_to_fine import COARSEST, match_coarse_to_fine, without_speckles
 from lsvision.image.stereo.refine import RefineOptions, refine_disparity
 from lsvision.image.stereo.relation import PairRelation, measure_relation
 from lsvision.image.stereo.residuals import Misfit
 from lsvision.image.stereo.sgbm import GrayPair, Search, match_sgbm
-from lsvision.image.stereo.steps import step_beside
+from lsvision.image.stereo.steps import other_side_variance
 from lsvision.image.tiling import HaloRange
 from lsvision.stages.disparity.config import COARSE_TO_FINE_PX, DisparityConfig
 from lsvision.types import LineImage, Rig, StereoPair, TensorImage
 
+# Times the pixels of a speckle: where the refinement has dropped most of a wrong patch, under glare, the rest is wrong.
+_LEFT_OVER = 4
 _BLANK_TEST_STEP = 9  # every ninth line shows whether a camera saw anything
 
 
@@ -151,14 +153,15 @@ def _measure(
         texture_confidence=config.texture_confidence,
     )
     refined = refine_disparity(left, right, disparity, options)
+    own = without_speckles(refined.disparity, _LEFT_OVER * config.speckle_px)
     misfit = Misfit.of(refined.residual_variance, block)
     factor = misfit.factor
     if disparity is not searched:
         factor = factor * holes_factor(searched, disparity, options.window_blocks(block))
-    # A place beside a step may belong to either side. All pixels of a block have one sigma.
-    sides = step_beside(searched, misfit.share, block).mul_(0.5)
-    growth = sides.div_(refined.sigma[::block, ::block]).square_().add_(factor).sqrt_()
-    return StripMatch(refined.disparity, refined.sigma.mul_(repeated(growth, block)[:lines, :width]))
+    lowest_px = float(disparity_range(rig, config)[0])
+    variance = other_side_variance(left, right, own, misfit.noise_variance, lowest_px)
+    sigma = variance.addcmul_(factor, refined.sigma.square()).sqrt_().add_(own - own)  # NaN where the disparity is
+    return StripMatch(enlarged(own, block)[:lines, :width], repeated(sigma, block)[:lines, :width])
 
 
 def _search(left: Tensor, right: Tensor, rig: Rig, config: DisparityConfig) -> Tensor:

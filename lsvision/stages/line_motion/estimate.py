@@ -1,10 +1,10 @@
 """Displacements of single lines -> the motion from line to line: smoothed, with covariance, and only what is there.
 
-Each component is a Gaussian process along the lines, as large, as long and as smooth as makes the lines likeliest; so
-is the scale and the memory of their errors (``estimation.signal_fit``). All components are smoothed together, because
-their errors are correlated: what a profile does not tell apart is split by how large each is. A component is corrected
-if the lines are much likelier with it than without, and if it exceeds the errors of a line: slower errors of the
-matching look like motion.
+Each component is a Gaussian process along the lines, as large, as long and as smooth as makes the lines likeliest
+(``estimation.signal_fit``), with errors that are known from the lines' halves (``errors``). All components are smoothed
+together, because their errors are correlated: what a profile does not tell apart is split by how large each is. A
+component is corrected if the lines are much likelier with it than without, and if it exceeds the errors of a line:
+slower errors of the matching look like motion.
 """
 
 import math
@@ -31,6 +31,7 @@ _SPREADS = {"sigma": 2.5, "length": 1.5, "noise_scale": 0.7, "memory": 0.7}  # o
 _NOTHING = 1e-3  # of the errors of a line: a component that is not there
 _OBSERVED = 2.0  # errors of a line over what a component usually amounts to, at most
 _SPIKE_SIGMA, _SPIKE_LINES = 8.0, 9
+_NORMAL = 1.4826  # standard deviation over median absolute deviation
 
 
 def not_measured(lines: int, reason: str) -> LineMotion:
@@ -71,16 +72,17 @@ def estimate(
 
 def _noisy_values(lines: Registered, usual_samples: int, config: LineMotionConfig) -> NoisyValues:
     """Values of lines, measured where enough samples took part and the line is no spike among its neighbours."""
-    loose = torch.diag(lines.values.new_tensor([10.0, 10.0, 0.1]) ** -2)
-    root = torch.linalg.cholesky(torch.linalg.inv(lines.information + loose))
+    root = torch.linalg.cholesky(lines.covariance)
     valid = (lines.samples >= max(1.0, config.min_share * usual_samples)) & lines.values.isfinite().all(1)
     values = torch.where(valid[:, None], lines.values, torch.nan)
     values = values - values.nanmedian(0).values.nan_to_num()
     half = _SPIKE_LINES // 2
     around = torch.cat([values[:1].expand(half, -1), values, values[-1:].expand(half, -1)]).unfold(0, _SPIKE_LINES, 1)
-    sigma = root.square().sum(-1).sqrt()
-    spike = ((values - around.nanmedian(-1).values).abs() > _SPIKE_SIGMA * sigma).any(1)
-    valid &= ~spike
+    off = (values - around.nanmedian(-1).values).abs()
+    usual = (
+        _NORMAL * off.nanmedian(0).values
+    ).nan_to_num()  # what the motion itself, and correlated errors, make of it
+    valid &= ~(off > _SPIKE_SIGMA * root.square().sum(-1).sqrt().maximum(usual)).any(1)
     return NoisyValues(torch.where(valid[:, None], values, 0.0), root, valid)
 
 

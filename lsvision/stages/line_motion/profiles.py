@@ -1,5 +1,6 @@
 """Samples of lines in the product frame, and the object's reference profile that they are compared with."""
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -91,7 +92,19 @@ def reference_profile(
     crown = float(profile.nan_to_num(-torch.inf).max())
     profile = profile.masked_fill(~(profile >= crown - depth_mm), torch.nan)
     slope = _slopes(profile, torch.arange(len(first)), reach, step_mm)
-    return Reference(origin, step_mm, profile, slope.masked_fill(slope.abs() > _STEEPEST, torch.nan))
+    slope = slope.masked_fill(slope.abs() > _STEEPEST, torch.nan)
+    if not bool(slope.isfinite().any()):
+        return None
+    # A slope of noise would show sideways motion where a flat profile shows none.
+    return Reference(origin, step_mm, profile, slope.masked_fill(slope.abs() < _sloping(slope, reach), 0.0))
+
+
+def _sloping(slope: Tensor, reach: int) -> float:
+    """Least slope that is told from noise: three standard deviations, by how uneven slopes far enough apart are."""
+    apart = 2 * reach + 1  # no height is in two of them
+    uneven = slope[apart:-apart] - (slope[: -2 * apart] + slope[2 * apart :]) / 2
+    sigma = 1.4826 * uneven.abs().nanmedian() / math.sqrt(1.5) if len(uneven) else uneven.new_zeros(())
+    return float(3 * sigma.nan_to_num())
 
 
 def _slopes(height: Tensor, position: Tensor, reach: int, step_mm: float) -> Tensor:

@@ -41,6 +41,11 @@ class Registered:
     difference: Float[Tensor, "lines 3"]
     difference_variance: Float[Tensor, "lines 3"]
 
+    @property
+    def covariance(self) -> Float[Tensor, "lines 3 3"]:
+        """Of the displacements, as independent samples would give; that of nothing known where nothing shows them."""
+        return torch.linalg.inv(self.information + _loose(self.values))
+
     @classmethod
     def joined(cls, parts: Sequence["Registered"]) -> "Registered":
         """Those of several ranges of lines, one after the other."""
@@ -74,7 +79,7 @@ def register(
     q_x, height = placed(samples, start, frame)
     rise = (height - reference.at(q_x)[0]).nanmedian(dim=1).values.nan_to_num()
     values = start - rise[:, None] * start.new_tensor([0.0, 1.0, 0.0])
-    loose = torch.diag(values.new_tensor(_LOOSE) ** -2)
+    loose = _loose(values)
     for step in range(config.iterations + len(_COARSE_MM)):
         equations = _equations(samples, values, reference, frame)
         cut = _COARSE_MM[step] if step < len(_COARSE_MM) else config.cut_sigma * equations.sigma
@@ -89,6 +94,11 @@ def register(
         difference = difference - sign * (covariance @ slope[..., None])[..., 0]
         variance = variance + covariance.diagonal(dim1=-2, dim2=-1)
     return Registered(values, information, used.sum(1), difference, variance)
+
+
+def _loose(values: Tensor) -> Tensor:
+    """Information that lets every displacement go."""
+    return torch.diag(values.new_tensor(_LOOSE) ** -2)
 
 
 @dataclass(frozen=True)

@@ -58,9 +58,9 @@ def _corners(image: np.ndarray) -> np.ndarray:
 
 
 def test_sigma_is_that_of_the_errors_on_boards(boards):
-    """The squares have no texture: most of what is measured lies beside their edges.
+    """The squares have no texture: what is measured lies beside their edges, and two fifths are off by over a pixel.
 
-    Sigma covers what a step of the surface would do there; a flat board has none, and errors are about half of it.
+    All of it counts: errors that were picked for being small say nothing about sigmas as large.
     """
     rig, views = boards
     errors, sigmas = [], []
@@ -79,9 +79,10 @@ def test_sigma_is_that_of_the_errors_on_boards(boards):
             *(torch.from_numpy(image)[..., None] for image in images), rig, DisparityConfig(height_range_mm=heights)
         )
         error = match.disparity - torch.from_numpy(plane[0] * u + plane[1] * v + plane[2])
-        right_ones = inside & (error.abs() <= 1.0)
-        errors.append(error[right_ones])
-        sigmas.append(match.sigma[right_ones])
+        errors.append(error[inside])
+        sigmas.append(match.sigma[inside])
     ratio = (torch.cat(errors) / torch.cat(sigmas)).abs()
-    assert 0.4 < ratio.median() / 0.6745 < 1.3
-    assert 0.6 < ratio.square().mean().sqrt() < 1.3
+    ratio = ratio[ratio.isfinite()]
+    assert 0.8 < ratio.median() / 0.6745 < 1.3
+    assert 0.8 < ratio[ratio <= 5].square().mean().sqrt() < 1.3
+    assert (ratio > 5).float().mean() < 0.005

@@ -4,6 +4,7 @@ import pytest
 import torch
 import torch.nn.functional as F  # noqa: N812
 
+from lsvision.image.stereo.blocks import enlarged
 from lsvision.image.stereo.coarse_to_fine import match_coarse_to_fine
 from lsvision.image.stereo.refine import RefineOptions, refine_disparity
 from lsvision.image.stereo.sgbm import GrayPair
@@ -32,7 +33,8 @@ def match(left, right, low=-40, high=40):
     grey = GrayPair.of(left, right)
     start = match_coarse_to_fine(grey, search(low, high), fine_check_px=4, noise=1.0)
     options = RefineOptions(window=9, iterations=1, noise=1.0, largest_sigma_px=0.5)
-    return refine_disparity(grey.left, grey.right, start, options).disparity
+    lines, width = grey.left.shape
+    return enlarged(refine_disparity(grey.left, grey.right, start, options).disparity, 2)[:lines, :width]
 
 
 @pytest.fixture

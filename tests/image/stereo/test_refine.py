@@ -6,6 +6,7 @@ import math
 import pytest
 import torch
 
+from lsvision.image.stereo.blocks import block_side, enlarged
 from lsvision.image.stereo.refine import RefineOptions, refine_disparity
 from lsvision.image.stereo.scatter import SigmaGains
 from lsvision.image.stereo.sgbm import GrayPair, match_sgbm
@@ -20,7 +21,8 @@ REFINE = RefineOptions(window=9, iterations=2, noise=0.5)
 
 
 def refine(left, right, start, options=REFINE, first_column=0):
-    return refine_disparity(left, right, start, options, first_column=first_column).disparity
+    found = refine_disparity(left, right, start, options, first_column=first_column).disparity
+    return enlarged(found, block_side(left, start))[: left.shape[0], : left.shape[1]]
 
 
 def texture(shift: torch.Tensor, noise: float = 0.0) -> torch.Tensor:
@@ -82,7 +84,7 @@ def naive_refinement(left, right, start, options):
     deviation = {p: min(max(mean(disparity, p) - disparity[p], -0.8), 0.8) ** 2 for p in pixels}
     for p in pixels:
         predicted = gains.iterations * sigma[p]
-        sigma[p] = math.sqrt(gains.scatter**2 * mean(deviation, p) + 0.15 * predicted**2 + 0.01**2)
+        sigma[p] = math.sqrt((0.9 * gains.scatter) ** 2 * mean(deviation, p) + 0.15 * predicted**2 + 0.01**2)
     return tuple(torch.tensor([each[p] for p in pixels]).view(lines, width) for each in (disparity, sigma))
 
 

@@ -77,8 +77,7 @@ def test_errors_of_neighbours_show_in_the_halves() -> None:
     profile, columns = reference()
     lines = samples_of(matched(rendered(STILL, FLAWLESS)[1])).on(columns)
     found = register(lines, torch.zeros(len(lines.z), 3).double(), profile, frame(), CONFIG)
-    loose = torch.diag(torch.tensor([10.0, 10.0, 0.1]).double() ** -2)
-    root = torch.linalg.cholesky(torch.linalg.inv(found.information + loose))
+    root = torch.linalg.cholesky(found.covariance)
     data = NoisyValues(found.values, root, torch.ones(len(root), dtype=torch.bool))
     errors, common = (LineErrors.of(found, data, common_mm) for common_mm in (0.0, 0.5))
     assert ((errors.scale > 1.2) & (errors.scale < 4.5)).all()  # a window of 9 px makes it 3 at most

@@ -41,12 +41,6 @@ class KernelFamily:
     roots: tuple[Float[Tensor, "_ knots _"], ...]
     log_prior: Float[Tensor, " kernels"]
 
-    def chosen(self, kept: Tensor) -> "KernelFamily":
-        """The kernels of a mask, their prior as it was."""
-        by_group = kept.split([len(group) for group in self.roots])
-        roots = tuple(group[some] for group, some in zip(self.roots, by_group, strict=True))
-        return KernelFamily(self.covariance[kept], roots, self.log_prior[kept])
-
     def to(self, like: Tensor) -> "KernelFamily":
         """The same in the dtype and on the device of a tensor."""
         roots = tuple(group.to(like) for group in self.roots)

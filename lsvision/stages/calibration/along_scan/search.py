@@ -13,7 +13,7 @@ import math
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from lsvision.estimation.gaussian_process import covariance_root
@@ -23,10 +23,11 @@ from lsvision.stages.calibration.along_scan.lines import COMPONENTS, Travel
 from lsvision.stages.calibration.problem import BoardProblem
 
 _COUNT = len(COMPONENTS)
+_SWEEPS = 2
+_SHOWN = 1.5  # size of errors at most, as it is reported, in units of the residuals' rms
 _PROCESSES = 2  # of a component, that add up
 _PRESENT = (0.2, 0.1)  # prior probabilities of a component's first process, and of its second where the first is there
 _THERE = 0.5  # probability of a process from which a further one is looked for
-_FAINT = -12.0  # log weight, of the largest, below which a kernel is not tried again
 _SHARED = 0.5  # prior probability that all components err at the same wavelengths
 
 
@@ -48,18 +49,16 @@ class Beforehand:
 class FoundErrors:
     """Covariance of the errors of each component at the knots, mm², and the log evidence for it.
 
+    ``rms_mm`` of each component is the most probable one, and little more than the residuals show: a covariance that is
+    a mean over amplitudes is larger, above all that of waves of which most is taken for poses and n.
     ``noise`` is that covariance and, by board, what a random walk of n explains. The constant that is missing in the
     evidence is the same for all linearisations of a problem.
     """
 
     covariance: Float[Tensor, "4 knots knots"]
     noise: Float[Tensor, "_ 4 knots knots"]
+    rms_mm: Float[Tensor, "4"]
     log_evidence: float
-
-    @property
-    def rms_mm(self) -> Float[Tensor, "4"]:
-        """Root-mean-square of each component."""
-        return self.covariance.diagonal(dim1=-2, dim2=-1).mean(-1).sqrt()
 
 
 def search(problem: BoardProblem, linearised: Linearised, known: Beforehand) -> FoundErrors | None:
@@ -77,8 +76,8 @@ class _Search:
     equations: NormalEquations
     family: KernelFamily
     covariances: Float[Tensor, "4 processes knots knots"]
+    rms_mm: Float[Tensor, "4 processes"]  # geometric means
     by_kernel: Float[Tensor, "4 kernels"]  # log likelihood ratio to no error; that there is none has its part in it
-    kept: Bool[Tensor, "4 kernels"]
     walk: Float[Tensor, "_ 4 knots knots"]  # covariance of what a walk of n explains, by board
 
     @classmethod
@@ -95,58 +94,61 @@ class _Search:
             equations=NormalEquations.of(problem, linearised),
             family=family,
             covariances=like.new_zeros(_COUNT, _PROCESSES, KNOTS, KNOTS),
+            rms_mm=like.new_zeros(_COUNT, _PROCESSES),
             by_kernel=like.new_zeros(_COUNT, kernels),
-            kept=torch.ones(_COUNT, kernels, dtype=torch.bool, device=like.device),
             walk=walk,
         )
 
     def found(self, log_odds: float) -> FoundErrors | None:
         """The errors that the corners show."""
-        alone = [self._log_ratios(component, 0, self.family) for component in range(_COUNT)]
+        alone = [self._log_ratios(component, 0) for component in range(_COUNT)]
         by_component = torch.stack([torch.logsumexp((a + self.family.log_prior[:, None]).flatten(), 0) for a in alone])
         evidence = torch.logsumexp(by_component, 0) - math.log(_COUNT * len(AMPLITUDES))
         if not bool(evidence > log_odds):
             return None
         # The component that errs most comes first: what it explains is no error of the others.
         order = by_component.argsort(descending=True).tolist()
-        first = [self._weigh_first(component) for component in order]
-        for layer in range(1, _PROCESSES):
-            for component, weighed in zip(order, first, strict=True):
-                if weighed.present > _THERE:
-                    self._weigh(component, layer, self.family, self.family.log_prior)
-        for component in order:  # again, now that the other components and processes are known
-            self._weigh_first(component)
+        for _ in range(_SWEEPS):  # the second knows of the other components and processes
+            first = [self._weigh_first(component) for component in order]
+            for layer in range(1, _PROCESSES):
+                for component, weighed in zip(order, first, strict=True):
+                    if weighed.present > _THERE:
+                        self._weigh(component, layer, self.family.log_prior)
         covariance = self.covariances.sum(1)
         present, roots = self._present(covariance + self.walk)
-        return FoundErrors(covariance, covariance + self.walk, float(self.equations.log_evidence(present, roots)))
+        log_evidence = float(self.equations.log_evidence(present, roots))
+        rms = torch.minimum(self.rms_mm.square().sum(-1).sqrt(), _SHOWN * self.equations.rms_mm)
+        return FoundErrors(covariance, covariance + self.walk, rms, log_evidence)
 
     def _weigh_first(self, component: int) -> "_Weighed":
         """Weigh the first process of a component."""
-        kept = self.kept[component]
-        weights = self._weigh(component, 0, self.family.chosen(kept), self._shared_prior(component)[kept])
-        self.by_kernel[component, kept] = weights.by_kernel
-        self.kept[component, kept.nonzero()[:, 0]] = weights.by_kernel > weights.by_kernel.max() + _FAINT
+        weights = self._weigh(component, 0, self._shared_prior(component))
+        self.by_kernel[component] = weights.by_kernel
         return weights
 
-    def _weigh(self, component: int, layer: int, family: KernelFamily, log_prior: Tensor) -> "_Weighed":
+    def _weigh(self, component: int, layer: int, log_prior: Tensor) -> "_Weighed":
         """Set the covariance of one process to its mean over kernels and amplitudes."""
         present, absent = math.log(_PRESENT[layer]), math.log(1.0 - _PRESENT[layer])
-        ratios = self._log_ratios(component, layer, family) - math.log(len(AMPLITUDES))
+        ratios = self._log_ratios(component, layer) - math.log(len(AMPLITUDES))
         joint = ratios + log_prior[:, None] + present
         none = torch.logsumexp(log_prior, 0) + absent
         evidence = torch.logaddexp(torch.logsumexp(joint.flatten(), 0), none)
         weights = torch.exp(joint - evidence)
-        by_variance = (weights * self._variances(component)).sum(-1)
-        self.covariances[component, layer] = torch.tensordot(by_variance, family.covariance, 1)
+        variances = self._variances(component)
+        probability = weights.sum().clamp(min=1e-300)
+        log_variance = (weights * variances.log()).sum() / probability
+        self.rms_mm[component, layer] = (probability * log_variance.exp()).sqrt()
+        by_variance = (weights * variances).sum(-1)
+        self.covariances[component, layer] = torch.tensordot(by_variance, self.family.covariance, 1)
         by_kernel = torch.logsumexp(ratios, -1) + present
-        return _Weighed(torch.logaddexp(by_kernel, by_kernel.new_tensor(absent)), float(weights.sum()))
+        return _Weighed(torch.logaddexp(by_kernel, by_kernel.new_tensor(absent)), float(probability))
 
-    def _log_ratios(self, component: int, layer: int, family: KernelFamily) -> Tensor:
+    def _log_ratios(self, component: int, layer: int) -> Tensor:
         """Log likelihood ratios of a process of each kernel and amplitude to none, the others as they stand."""
         standing = self.covariances.clone()
         standing[component, layer] = 0.0
         given = self.equations.given(component, *self._present(standing.sum(1) + self.walk))
-        return self.equations.log_ratios(given, family, self._variances(component))
+        return self.equations.log_ratios(given, self.family, self._variances(component))
 
     def _present(self, covariance: Tensor) -> tuple[Tensor, Tensor]:
         """Which components err at all, and the roots of their covariances."""
