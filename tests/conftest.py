@@ -27,6 +27,9 @@ install_checks(
     ]
 )
 
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as in a background job: programs under test would ignore it too
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+
 torch.set_num_threads(1)  # before the fixtures of wider scope; xdist's workers share the processor
 
 # The same examples every time, and no clock: a slow machine is no failure.
