@@ -1,4 +1,4 @@
-"""The one way in which JSON files are written: never with NaN or infinity, which JSON does not have."""
+"""The one way in which JSON is written: never with NaN or infinity, which JSON does not have."""
 
 import json
 import math
@@ -18,7 +18,16 @@ def write_json(path: Path | str, data: object, *, strict: bool = False) -> None:
         ValueError: the data hold NaN or infinity, with ``strict``.
     """
     plain = data if strict else finite_or_null(data)
-    write_text(path, json.dumps(plain, indent=2, allow_nan=False, ensure_ascii=False) + "\n")
+    write_text(path, json_text(plain, indent=2) + "\n")
+
+
+def json_text(data: object, *, indent: int | None = None) -> str:
+    """Plain data as JSON.
+
+    Raises:
+        ValueError: the data hold NaN or infinity.
+    """
+    return json.dumps(data, indent=indent, allow_nan=False, ensure_ascii=False)
 
 
 def finite_or_null(data: object) -> object:

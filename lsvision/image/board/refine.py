@@ -139,5 +139,5 @@ def read_windows(
         columns = (centre[here, 0, None] + span)[:, None, :]
         pixels = strip[rows, columns]
         windows[here] = gray(pixels).to(torch.float64)
-        brightest[here] = pixels.amax(-1).to(torch.float64)
+        brightest[here] = pixels.to(torch.float64).amax(-1)  # 16 bit has no maximum
     return windows, brightest

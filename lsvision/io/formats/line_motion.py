@@ -21,6 +21,7 @@ from lsvision.errors import FileFormatError
 from lsvision.geometry import uneven_travel
 from lsvision.io.atomic import partial_file
 from lsvision.io.formats.validation import on_one_line, read_bytes, read_entries
+from lsvision.io.json_file import json_text
 from lsvision.schema import near_hint
 from lsvision.types import LINE_COMPONENTS, LineFinding, LineMotion, Travel
 
@@ -54,7 +55,7 @@ def write_line_motion(motion: LineMotion, path: Path | str) -> None:
         columns[name] = torch.where(scale > 0, motion.covariance[:, i, j] / scale, 0.0).clamp(-1, 1)
     always = ("line", *VALUE_COLUMNS)
     kept = {name: values.numpy() for name, values in columns.items() if name in always or bool(values.any())}
-    found = json.dumps([asdict(finding) for finding in motion.findings])
+    found = json_text([asdict(finding) for finding in motion.findings])
     with partial_file(path) as partial:
         polars.DataFrame(kept).write_parquet(partial, metadata={_FINDINGS: found} if motion.findings else None)
 
