@@ -7,7 +7,7 @@ import pytest
 pytestmark = [pytest.mark.slow, pytest.mark.drawn]
 
 
-def _check(summary, *, sheet_px):
+def _check(summary, *, sheet_px, numbers_rel):
     paper, still, vibrating = summary["paper"], summary["still"], summary["vibrating"]
     joint, two_step = still["joint"], still["two_step"]
     floor = [abs(n - true) for n, true in zip(joint["n"], joint["n_true"], strict=True)]
@@ -25,7 +25,7 @@ def _check(summary, *, sheet_px):
         assert scenario["joint"]["held_out_rmse_mm"] < bound < 2.0 < scenario["held_out_rmse_before_mm"]
     numbers = summary["paper_numbers"]
     for key in ("rmse_before_mm", "rmse_after_mm", "stretch"):
-        assert numbers[key] == pytest.approx(paper[key], rel=0.003)
+        assert numbers[key] == pytest.approx(paper[key], rel=numbers_rel)
     assert numbers["iterations"] == paper["iterations"]
     products = still["products"]
     for board in products["board_distance_rms_mm"].values():
@@ -38,11 +38,12 @@ def _check(summary, *, sheet_px):
 
 def test_the_paper_at_a_quarter_of_the_pixels(command, tmp_path):
     assert command("+experiment=paper") == 0
-    _check(json.loads((tmp_path / "run" / "summary.json").read_text()), sheet_px=1.0)
+    _check(json.loads((tmp_path / "run" / "summary.json").read_text()), sheet_px=1.0, numbers_rel=0.003)
     assert (tmp_path / "run" / "report.html").stat().st_size > 100_000
     assert not list(tmp_path.rglob("*.partial"))
 
 
 def test_the_paper_at_a_tenth_of_the_pixels(command, tmp_path):
     assert command("+experiment=paper", "scale=10", "vibrating.seed=100") == 0
-    _check(json.loads((tmp_path / "run" / "summary.json").read_text()), sheet_px=1.0)
+    # Windows of 9 mm around a corner level a part of the shortest wave, of 61 mm, out.
+    _check(json.loads((tmp_path / "run" / "summary.json").read_text()), sheet_px=1.0, numbers_rel=0.08)
