@@ -2,8 +2,6 @@
 
 import hashlib
 import logging
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -15,6 +13,7 @@ from lsvision.archive.identity import ScanFiles, key_of
 from lsvision.archive.opened import open_depth, open_scan, planned_files
 from lsvision.errors import FileFormatError, LsvisionError
 from lsvision.geometry import travel_at
+from lsvision.image.tiling import one_torch_thread
 from lsvision.io import naming_full_disk, read_line_motion, write_line_motion
 from lsvision.io.formats.validation import on_one_line, read_bytes
 from lsvision.stages.disparity.config import DisparityConfig
@@ -118,10 +117,10 @@ def measured_line_motion(scan: Scan, depth: DepthSource, motion: Motion, config:
 
     What cannot be measured is no error: the findings say why.
     """
-    with _one_thread():
+    with one_torch_thread():
         try:
             return measure_line_motion(scan, DepthAlone(depth), motion, config)
-        except (IndexError, ValueError, torch.linalg.LinAlgError) as error:  # an object of next to no samples
+        except (ValueError, torch.linalg.LinAlgError) as error:  # an object of next to no samples
             log.warning("%s: no line motion can be measured: %s", scan.path, on_one_line(error))
             return not_measured(scan.lines, "the scan shows no profile that lines can be registered to")
 
@@ -182,7 +181,7 @@ def line_motion_metadata(motion: LineMotion, origin: Origin, travel: Travel) -> 
 
 
 def ambiguity_in_words(band: tuple[float, float]) -> str:
-    """What nobody can tell from vibration on a profile alone."""
+    """Which wavelengths may be shape or vibration: a profile alone does not show which."""
     return (
         f"wavelengths of {band[0]:.3g} to {band[1]:.3g} mm were taken for vibration: corrugation, bow or twist of the "
         "object over such lengths shows the same on its profile"
@@ -199,13 +198,3 @@ def open_line_motion(store: str, sha256: str, scan: Scan) -> LineMotion:
     if stored.sha256 != sha256:
         raise LsvisionError(f"{store}: changed while it was in use; the next run measures it afresh")
     return stored.motion
-
-
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)

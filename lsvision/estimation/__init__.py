@@ -12,7 +12,7 @@ from lsvision.estimation.consistency import chi_square_tail, mean_chi_square_ban
 from lsvision.estimation.cubature import AffineModel, slr
 from lsvision.estimation.derivative import jacobian
 from lsvision.estimation.filtering import StateSpace, Track, Update, filter_sequence, predict, update
-from lsvision.estimation.gaussian import Gaussian, Prior
+from lsvision.estimation.gaussian import NORMAL_OVER_MAD, Gaussian, Prior
 from lsvision.estimation.information import (
     Directions,
     cramer_rao_bound,
@@ -30,6 +30,7 @@ from lsvision.estimation.smoothing import smooth
 from lsvision.estimation.state_space_process import Process, matern, oscillation
 
 __all__ = [
+    "NORMAL_OVER_MAD",
     "AffineModel",
     "Directions",
     "Gaussian",

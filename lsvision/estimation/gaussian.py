@@ -7,6 +7,8 @@ from torch import Tensor
 
 from lsvision.estimation.linalg import apply, batch_first, batch_last
 
+NORMAL_OVER_MAD = 1.4826  # standard deviation of a normal distribution over its median absolute deviation
+
 
 @dataclass(frozen=True)
 class Gaussian:

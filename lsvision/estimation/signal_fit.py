@@ -43,7 +43,7 @@ class SignalParameters:
     def model(self) -> SignalModel:
         """The model for filter and smoother.
 
-        A signal lasts longer than the noise's memory: what does not cannot be told from noise and counts as it.
+        A signal lasts longer than the noise's memory: a shorter one looks like noise and counts as noise.
         """
         length = self.length.maximum(2 * self.memory)
         processes = [

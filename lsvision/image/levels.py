@@ -19,7 +19,7 @@ _NO_CODE = 2**32
 _DEPTHS = (10, 12, 14, 16)  # bits of sensors whose images have sixteen
 _HOT_SHARE = 2e-4  # of the samples may lie above a plateau: hot pixels
 _PLATEAU_SHARE, _PLATEAU_RISE, _PLATEAU_BELOW = 1e-3, 2.0, 3  # of the samples; over the most frequent code just below
-_GROUP = 16  # neighbouring columns tell how one of them should vary
+_GROUP = 16  # neighbouring columns, by which the variation of one of them is judged
 # Shares of the usual range along the scan, which must be at least 3 codes. A column counts as stuck only where the
 # columns on both sides vary: at the edge of a dark area the range changes from column to column.
 _STUCK, _LIVELY, _LEAST_RANGE = 0.1, 0.5, 3.0

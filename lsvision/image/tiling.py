@@ -5,8 +5,9 @@ import functools
 import os
 import sys
 import threading
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor, wait
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TypeVar
 
@@ -101,6 +102,17 @@ def _pool(threads: int, _process: int) -> ThreadPoolExecutor:
         thread.result()
     torch.set_num_threads(threads)  # the setting of one thread also holds for those started later
     return pool
+
+
+@contextmanager
+def one_torch_thread() -> Iterator[None]:
+    """One thread for each of torch's operations within the block: for bits, or where other threads work already."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 def keep_freed_memory() -> bool:

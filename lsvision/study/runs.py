@@ -1,15 +1,15 @@
 """Many noisy calibrations of a study's points: drawn, calibrated in batches, joined."""
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from lsvision.image.tiling import one_torch_thread
 from lsvision.report.progress import progress_bars
 from lsvision.stages.calibration.calibrate import BatchCalibration, calibrate_batch
 from lsvision.stages.calibration.config import CalibrationConfig
@@ -100,7 +100,7 @@ def run_points(
         for first in range(0, runs, size)
     ]
     found: list[list[BatchCalibration]] = [[] for _ in points]
-    with progress_bars() as bars, _one_torch_thread(), ThreadPoolExecutor(sampling.threads) as pool:
+    with progress_bars() as bars, one_torch_thread(), ThreadPoolExecutor(sampling.threads) as pool:
         bar = bars.start("calibrate", total=len(points) * runs)
         results = pool.map(lambda batch: batch.calibrate(config, sampling.seed), batches)
         for batch, result in zip(batches, results, strict=True):
@@ -144,14 +144,3 @@ def _wave(travel: Tensor, wavelength_mm: float, phase: Tensor) -> Tensor:
     """Sine waves along the travel whose rms is one, ``(runs, boards, corners, waves)``."""
     angle = (2 * math.pi / wavelength_mm) * travel
     return math.sqrt(2.0) * torch.sin(angle[..., None] + phase[..., None, :])
-
-
-@contextmanager
-def _one_torch_thread() -> Iterator[None]:
-    """One thread for torch: batches run on several threads already, and torch's own would wait for each other."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)

@@ -5,6 +5,7 @@ import torch.nn.functional as F  # noqa: N812
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from lsvision.estimation import NORMAL_OVER_MAD
 from lsvision.image.board.lattice import QuadraticMap
 from lsvision.image.board.saddle import SaddleFit
 
@@ -15,10 +16,9 @@ _LEAST_RESIDUAL_EXCESS, _EXCESS_SPREADS = 0.35, 6.0
 _CLIPPED_LEVEL = 0.998  # of the largest number that the pixels can have
 _CLIPPED_APART = 0.15  # share of a window's pixels, from the board's median: white squares with a bright rim are sound
 _OUT_OF_LINE_SPREADS, _OUT_OF_LINE_PX = 12.0, 0.5  # perspective and lenses bend rows at the rim
-_TELLS, _AGREES = 2.0, 0.5  # neighbours along one axis: their spread over that of all; share of the limit to agree
+_ONE_AXIS, _AGREES = 2.0, 0.5  # neighbours along one axis: their spread over that of all; share of the limit to agree
 _FEWEST_IN_LINE = 12
 _ALONG_X, _ALONG_Y = (0, 1), (1, 0)  # steps (down, right) of a grid
-_NORMAL = 1.4826  # standard deviation of a normal distribution over its median absolute deviation
 
 
 def like_the_board(fit: SaddleFit, valid: Bool[Tensor, " corners"]) -> Bool[Tensor, " corners"]:
@@ -31,7 +31,7 @@ def like_the_board(fit: SaddleFit, valid: Bool[Tensor, " corners"]) -> Bool[Tens
     valid = valid & (fit.contrast > _LEAST_CONTRAST * _median(fit.contrast, valid))
     relative = fit.residual / fit.contrast
     excess = torch.minimum(fit.residual / _median(fit.residual, valid), relative / _median(relative, valid)) - 1
-    spread = _NORMAL * _median(excess.abs(), valid)
+    spread = NORMAL_OVER_MAD * _median(excess.abs(), valid)
     return valid & (excess <= (_EXCESS_SPREADS * spread).clamp(min=_LEAST_RESIDUAL_EXCESS))
 
 
@@ -61,8 +61,9 @@ def in_line_with_neighbours(
     Each is compared with the median of what pairs of neighbours say: those on both of its sides where it has such, as
     at a corner of the board, or beside hidden ones, it can only be extrapolated. What is too far follows from how far
     the same makes the board's other corners: under vibration or uneven travel all are out of line. A vibration moves
-    whole lines of the scan, and with them whole rows of a board: a corner stays where neighbours along one axis, which
-    tell as much as all, expect it, and one between neighbours along one axis only may be as far off as those beside it.
+    whole lines of the scan, and with them whole rows of a board: a corner is kept where neighbours along one axis
+    expect it, if these fit as well as all neighbours do, and one between neighbours along one axis only may be as far
+    off as those beside it.
     """
     if int(valid.sum()) < _FEWEST_IN_LINE:
         return valid
@@ -102,7 +103,7 @@ def _is_out_of_line(apart: Float[Tensor, "3 rows columns 2"]) -> Bool[Tensor, "r
     """What is far from where all neighbours expect it, and not about where those along one axis do."""
     spread, limit, wrong = _spread(apart), _limit(apart), _is_far(apart)[0]
     for axis in (1, 2):
-        agrees = (apart[axis].abs() <= _AGREES * limit[axis]) & (spread[axis] < _TELLS * spread[0])
+        agrees = (apart[axis].abs() <= _AGREES * limit[axis]) & (spread[axis] < _ONE_AXIS * spread[0])
         wrong = wrong & ~agrees
     return wrong
 
@@ -120,7 +121,7 @@ def _shifted(values: Float[Tensor, "rows columns 2"], axis: tuple[int, int], ste
 
 
 def _spread(apart: Float[Tensor, "tests rows columns 2"]) -> Float[Tensor, "tests 1 1 2"]:
-    spread = _NORMAL * apart.abs().flatten(1, 2).nanmedian(1).values
+    spread = NORMAL_OVER_MAD * apart.abs().flatten(1, 2).nanmedian(1).values
     return spread.nan_to_num(torch.inf)[:, None, None]
 
 

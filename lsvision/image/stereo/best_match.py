@@ -56,7 +56,7 @@ def matching_cost(
 
 
 def stretches(marked: Bool[Tensor, " columns"], room: int = _ROOM_PX) -> list[slice]:
-    """Stretches of marked columns with room on either side, that of a search where not told."""
+    """Stretches of marked columns, with ``room`` more columns on either side."""
     wide = F.max_pool1d(marked.float()[None], 2 * room + 1, 1, room)[0]
     bounds = F.pad(wide, (1, 1)).diff().nonzero()[:, 0].view(-1, 2)
     return [slice(start, stop) for start, stop in bounds.tolist()]

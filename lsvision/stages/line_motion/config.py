@@ -17,11 +17,11 @@ class LineMotionConfig(Checked):
     object's samples was measured is interpolated from the others; so are all lines of which too few are left.
     The errors of a line follow from its halves, which see the same motion; ``common_error_px`` of disparity is what a
     line's depths err by all together (on rendered rails 0.005 to 0.013). ``expected_x_mm``, ``expected_z_mm`` and
-    ``expected_roll_deg`` are what vibration usually amounts to (rms): they keep apart what the profile does not tell
-    apart, as roll and sideways motion of a crown. A component that a line shows no better than to twice that is not
-    observed. ``evidence`` is how much better, in units of the logarithm of the likelihood, the lines must fit with a
-    component for it to be corrected; and it must be ``least_ratio`` times the errors of a single line at least, as
-    errors of the matching may last for many lines.
+    ``expected_roll_deg`` are the usual vibration (rms): they separate components that look alike on the profile, as
+    roll and sideways motion of a crown. A component whose error on a line exceeds twice that is not observed.
+    ``evidence`` is how much better, in units of the logarithm of the likelihood, the lines must fit with a component
+    for it to be corrected; and it must be ``least_ratio`` times the errors of a single line at least, as errors of the
+    matching may last for many lines.
     Lines are smoothed in blocks of ``block_lines`` with ``halo_lines`` on either side.
     """
 

@@ -16,7 +16,7 @@ from lsvision.stages.line_motion.register import Registered
 _LAGS = 100
 _FORGOTTEN = 0.1  # correlation below which the sum over the lags ends
 _LEAST_MEMORY, _USUAL_MEMORY = 0.3, 8.0  # lines
-_LEAST_LINES = 200  # from which on the differences tell the memory
+_LEAST_LINES = 200  # needed to estimate the memory from the differences
 
 
 @dataclass(frozen=True)

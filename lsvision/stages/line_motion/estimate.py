@@ -2,7 +2,7 @@
 
 Each component is a Gaussian process along the lines, as large, as long and as smooth as makes the lines likeliest
 (``estimation.signal_fit``), with errors that are known from the lines' halves (``errors``). All components are smoothed
-together, because their errors are correlated: what a profile does not tell apart is split by how large each is. A
+together, because their errors are correlated: what looks alike on a profile is split by how large each component is. A
 component is corrected if the lines are much likelier with it than without, and if it exceeds the errors of a line:
 slower errors of the matching look like motion.
 """
@@ -16,14 +16,21 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import pad
 
-from lsvision.estimation import NoisyValues, SignalFit, SignalParameters, fit_signals, smooth_signals
+from lsvision.estimation import (
+    NORMAL_OVER_MAD,
+    NoisyValues,
+    SignalFit,
+    SignalParameters,
+    fit_signals,
+    smooth_signals,
+)
 from lsvision.geometry import without_trend
 from lsvision.stages.line_motion.config import LineMotionConfig
 from lsvision.stages.line_motion.errors import LineErrors
 from lsvision.stages.line_motion.register import Registered
 from lsvision.types import LINE_COMPONENTS, LineFinding, LineMotion
 
-_LEAST_LINES = 64  # measured; fewer do not tell a motion from errors
+_LEAST_LINES = 64  # measured; with fewer, motion and errors cannot be separated
 _FIT_SAMPLES, _FIT_SEQUENCES = 256, 4  # that the likelihood is taken of
 _USUAL_STATES, _OTHER_STATES = 2, (1, 3)
 _USUAL_LENGTH = 60.0  # lines
@@ -31,7 +38,6 @@ _SPREADS = {"sigma": 2.5, "length": 1.5, "noise_scale": 0.7, "memory": 0.7}  # o
 _NOTHING = 1e-3  # of the errors of a line: a component that is not there
 _OBSERVED = 2.0  # errors of a line over what a component usually amounts to, at most
 _SPIKE_SIGMA, _SPIKE_LINES = 8.0, 9
-_NORMAL = 1.4826  # standard deviation over median absolute deviation
 
 
 def not_measured(lines: int, reason: str) -> LineMotion:
@@ -79,9 +85,7 @@ def _noisy_values(lines: Registered, usual_samples: int, config: LineMotionConfi
     half = _SPIKE_LINES // 2
     around = torch.cat([values[:1].expand(half, -1), values, values[-1:].expand(half, -1)]).unfold(0, _SPIKE_LINES, 1)
     off = (values - around.nanmedian(-1).values).abs()
-    usual = (
-        _NORMAL * off.nanmedian(0).values
-    ).nan_to_num()  # what the motion itself, and correlated errors, make of it
+    usual = (NORMAL_OVER_MAD * off.nanmedian(0).values).nan_to_num()  # due to the motion itself and correlated errors
     valid &= ~(off > _SPIKE_SIGMA * root.square().sum(-1).sqrt().maximum(usual)).any(1)
     return NoisyValues(torch.where(valid[:, None], values, 0.0), root, valid)
 
@@ -173,7 +177,7 @@ def _expected(config: LineMotionConfig) -> Float[Tensor, "3"]:
 
 
 def _is_observed(noise: Float[Tensor, "3"], index: int, config: LineMotionConfig) -> bool:
-    """Whether lines show a component to twice of what it usually amounts to."""
+    """Whether the error of a line is at most twice what a component usually amounts to."""
     return bool(noise[index] <= _OBSERVED * _expected(config)[index])
 
 

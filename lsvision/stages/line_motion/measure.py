@@ -68,6 +68,8 @@ def _shown(frame: ProductFrame, depth: DepthSource, config: LineMotionConfig) ->
         if reference is None:
             return None
         columns = columns_of(reference, q_x, config.samples)
+        if columns is None:
+            return None
         found = register(samples.on(columns), values, reference, frame, config)
         values = found.values - found.values.median(0).values
         shown = _Shown(reference, columns, int(found.samples.median()))

@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from lsvision.estimation import NORMAL_OVER_MAD
 from lsvision.geometry import ProductFrame, depth_sigma, slope_at, zero_disparity_mm
 from lsvision.types import Depth
 
@@ -100,10 +101,10 @@ def reference_profile(
 
 
 def _sloping(slope: Tensor, reach: int) -> float:
-    """Least slope that is told from noise: three standard deviations, by how uneven slopes far enough apart are."""
+    """Least slope that stands out from noise: three standard deviations of the unevenness of slopes far apart."""
     apart = 2 * reach + 1  # no height is in two of them
     uneven = slope[apart:-apart] - (slope[: -2 * apart] + slope[2 * apart :]) / 2
-    sigma = 1.4826 * uneven.abs().nanmedian() / math.sqrt(1.5) if len(uneven) else uneven.new_zeros(())
+    sigma = NORMAL_OVER_MAD * uneven.abs().nanmedian() / math.sqrt(1.5) if len(uneven) else uneven.new_zeros(())
     return float(3 * sigma.nan_to_num())
 
 
@@ -115,11 +116,16 @@ def _slopes(height: Tensor, position: Tensor, reach: int, step_mm: float) -> Ten
     return slope
 
 
-def columns_of(reference: Reference, q_x: Float[Tensor, "lines columns"], most: int) -> slice:
-    """At most so many columns, evenly spaced, that show the object on some of the lines with samples at ``q_x``."""
+def columns_of(reference: Reference, q_x: Float[Tensor, "lines columns"], most: int) -> slice | None:
+    """At most so many columns, evenly spaced, that show the object on some of the lines with samples at ``q_x``.
+
+    None where the object is narrower than a slope takes.
+    """
     there = reference.slope.isfinite().nonzero()[[0, -1], 0]
     low, high = (reference.origin_mm + reference.step_mm * there.double()).tolist()
     shown = ((q_x > low) & (q_x < high)).any(0).nonzero()[:, 0]
+    if not len(shown):
+        return None
     first, end = int(shown[0]), int(shown[-1]) + 1
     return slice(first, end, -(-(end - first) // most))
 

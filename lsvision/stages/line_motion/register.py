@@ -83,22 +83,31 @@ def register(
     for step in range(config.iterations + len(_COARSE_MM)):
         equations = _equations(samples, values, reference, frame)
         cut = _COARSE_MM[step] if step < len(_COARSE_MM) else config.cut_sigma * equations.sigma
-        information, slope, used = equations.weighted(cut)
-        values = values - torch.linalg.solve(information + loose, slope)
+        normal = equations.weighted(cut)
+        values = values - torch.linalg.solve(normal.information + loose, normal.slope)
     equations = _equations(samples, values, reference, frame)
     difference, variance = torch.zeros_like(values), torch.zeros_like(values)
     half = (samples.columns - samples.columns[0]) // _PIECE_PX % 2
     for side, sign in ((0, 1.0), (1, -1.0)):
-        part, slope, _ = equations.weighted(config.cut_sigma * equations.sigma, half == side)
-        covariance = torch.linalg.inv(part + loose)
-        difference = difference - sign * (covariance @ slope[..., None])[..., 0]
+        part = equations.weighted(config.cut_sigma * equations.sigma, half == side)
+        covariance = torch.linalg.inv(part.information + loose)
+        difference = difference - sign * (covariance @ part.slope[..., None])[..., 0]
         variance = variance + covariance.diagonal(dim1=-2, dim2=-1)
-    return Registered(values, information, used.sum(1), difference, variance)
+    return Registered(values, normal.information, normal.used.sum(1), difference, variance)
 
 
 def _loose(values: Tensor) -> Tensor:
     """Information that lets every displacement go."""
     return torch.diag(values.new_tensor(_LOOSE) ** -2)
+
+
+@dataclass(frozen=True)
+class _NormalEquations:
+    """Jᵀ W J and Jᵀ W r of every line, and the samples that take part."""
+
+    information: Float[Tensor, "lines 3 3"]
+    slope: Float[Tensor, "lines 3"]
+    used: Bool[Tensor, "lines columns"]
 
 
 @dataclass(frozen=True)
@@ -109,10 +118,8 @@ class _Equations:
     sigma: Float[Tensor, "lines columns"]
     by_motion: tuple[Tensor, Tensor, Tensor]
 
-    def weighted(
-        self, cut: Tensor | float, among: Bool[Tensor, " columns"] | None = None
-    ) -> tuple[Tensor, Tensor, Bool[Tensor, "lines columns"]]:
-        """Jᵀ W J and Jᵀ W r of every line, and the samples that take part, of all columns or some."""
+    def weighted(self, cut: Tensor | float, among: Bool[Tensor, " columns"] | None = None) -> _NormalEquations:
+        """The normal equations of all columns or some; samples beyond ``cut``, mm, do not count."""
         inside = (1 - (self.residual / cut).square()).clamp(min=0)  # NaN where nothing was measured
         weight = (inside / self.sigma).square()
         used = weight > 0 if among is None else (weight > 0) & among
@@ -120,7 +127,7 @@ class _Equations:
         rows = [by.masked_fill(~used, 0.0) for by in self.by_motion]
         heavy = [row * weight for row in rows]
         information = torch.stack([torch.stack([(a * b).sum(1) for b in rows], -1) for a in heavy], -2)
-        return information, torch.stack([(a * residual).sum(1) for a in heavy], -1), used
+        return _NormalEquations(information, torch.stack([(a * residual).sum(1) for a in heavy], -1), used)
 
 
 def _equations(samples: LineSamples, values: Tensor, reference: Reference, frame: ProductFrame) -> _Equations:

@@ -143,3 +143,14 @@ def test_a_flat_plane_shows_depth_and_roll_alone() -> None:
     found = measure(matched(torch.full((300, RIG.width_px), 810.0)))
     assert states(found) == ["not observed", "absent", "absent"]
     assert found.findings[2].sigma < math.radians(0.01)
+
+
+@pytest.mark.parametrize("columns", [1, 2, 3])
+def test_an_object_of_a_few_columns_is_not_measured(columns: int) -> None:
+    _, depth = rendered(STILL)
+    strip = torch.full_like(depth[:100], torch.nan)
+    middle = depth.shape[1] // 2
+    strip[:, middle : middle + columns] = matched(depth)[:100, middle : middle + columns]
+    found = measure(strip)
+    assert states(found) == ["not observed"] * 3
+    assert found.is_still

@@ -18,7 +18,7 @@ KNOTS = 32
 INTERVALS = KNOTS - 3  # over the travel; interpolation takes one more knot at each end
 
 # Lengths of broad-band errors. Rough ones (exponential) that are shorter look like smooth ones (Matérn). Longer ones
-# are drifts, which a few boards hardly tell from shorter ones, and of which the mean over kernels would consist.
+# are drifts: on a few boards they look much like shorter ones, and they would dominate the mean over kernels.
 _ROUGH_LENGTHS = (0.25, 0.5)
 _SMOOTH_LENGTHS = (0.0625, 0.125, 0.25, 0.5)
 # Waves per unit. Of those that soon lose their phase, neighbours nearer than a quarter look alike.
