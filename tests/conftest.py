@@ -3,7 +3,7 @@
 import gc
 import signal
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import hypothesis
@@ -54,6 +54,15 @@ def _seeded() -> None:
     torch.set_num_threads(1)
 
 
+@pytest.fixture(autouse=True)
+def _signals() -> Iterator[None]:
+    """A program ignores signals at its end, and so would all that a test process starts after it."""
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
 @pytest.fixture(scope="session")
 def shared_data() -> Path:
     """Real photographs and scans by another renderer, where the folder is present."""
@@ -102,10 +111,6 @@ def command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, quick_reports: None
             run.main()
         except SystemExit as stop:
             return int(stop.code or 0)
-        finally:  # a program ignores signals at its end; the tests go on
-            for number, handler in handlers.items():
-                signal.signal(number, handler)
         return 0
 
-    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
     return call
