@@ -104,6 +104,22 @@ def hidden_from_children() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
+def start_resource_tracker() -> None:
+    """Start the process in which multiprocessing removes what ended processes have left behind, semaphores above all.
+
+    At its start it would make Ctrl-C visible again within ``hidden_from_children``: it is started before that. It does
+    not report what it removes: a run that was ended leaves such things, and its line is the last one.
+    """
+    from multiprocessing import resource_tracker  # here, so that the handler is there before anything heavy
+
+    quiet = "ignore::UserWarning:multiprocessing.resource_tracker"
+    sys.warnoptions.append(quiet)  # which children get
+    try:
+        resource_tracker.ensure_running()
+    finally:
+        sys.warnoptions.remove(quiet)
+
+
 def _in_main_thread() -> bool:
     return threading.current_thread() is threading.main_thread()
 

@@ -111,6 +111,20 @@ def test_blocks_that_must_not_be_interrupted():
     assert done.stderr.startswith("interrupted: ")
 
 
+def test_what_an_ended_process_leaves_is_removed_without_a_word():
+    text = """
+    import os
+    from multiprocessing import resource_tracker
+    from lsvision.interruption import start_resource_tracker
+    start_resource_tracker()
+    resource_tracker.register("/lsvision-left", "semaphore")  # as by a process that was killed
+    os._exit(0)
+    """
+    text = textwrap.dedent(text)
+    done = subprocess.run([sys.executable, "-c", text], capture_output=True, text=True, check=False, timeout=60)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
 def test_children_do_not_see_ctrl_c():
     with hidden_from_children():
         child = subprocess.Popen(

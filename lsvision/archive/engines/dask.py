@@ -5,7 +5,6 @@ import os
 from concurrent.futures import CancelledError
 from contextlib import suppress
 from dataclasses import asdict
-from multiprocessing import resource_tracker
 from pathlib import Path
 from queue import Empty, SimpleQueue
 from types import TracebackType
@@ -18,7 +17,7 @@ from distributed.security import Security
 from lsvision.archive.engines.protocol import MAX_WORKER_CRASHES, WORKERS_CRASHED, Finished, TlsFiles
 from lsvision.archive.tasks import Outcome, Task, run_in_worker
 from lsvision.errors import ConfigError, LsvisionError
-from lsvision.interruption import hidden_from_children, uninterrupted
+from lsvision.interruption import hidden_from_children, start_resource_tracker, uninterrupted
 
 _POLL_SECONDS = 1.0
 
@@ -142,7 +141,7 @@ class DaskEngine:
 
 
 def _local_cluster(workers: int, worker_memory_mb: int, security: Security | None) -> LocalCluster:
-    resource_tracker.ensure_running()  # at its start it would make Ctrl-C visible again
+    start_resource_tracker()
     with hidden_from_children():
         return LocalCluster(
             n_workers=workers,

@@ -10,14 +10,14 @@ from collections import deque
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import suppress
-from multiprocessing import forkserver, resource_tracker
+from multiprocessing import forkserver
 from types import TracebackType
 from typing import Literal
 
 from lsvision.archive.engines.protocol import MAX_FAILED_STARTS, MAX_WORKER_CRASHES, WORKERS_CRASHED, Finished
 from lsvision.archive.tasks import Outcome, Task, run_in_worker
 from lsvision.errors import LsvisionError
-from lsvision.interruption import hidden_from_children, uninterrupted
+from lsvision.interruption import hidden_from_children, start_resource_tracker, uninterrupted
 
 StartMethod = Literal["forkserver", "spawn"]
 
@@ -49,7 +49,7 @@ class LocalEngine:
         # The task that every other worker is at; None while it starts.
         self._busy: dict[Future, tuple[Task | None, ProcessPoolExecutor]] = {}
         self._failed_starts = 0
-        resource_tracker.ensure_running()  # at its start it would make Ctrl-C visible again
+        start_resource_tracker()
         try:
             if start_method == "forkserver":
                 self._wait_for_server()
