@@ -41,6 +41,7 @@ from lsvision.geometry.product_axes import (
     product_pose,
     to_product,
 )
+from lsvision.geometry.raw_pair import LineCamera, Met, RawPair, Seen
 from lsvision.geometry.rigid import (
     euler_angles,
     fit_rigid,
@@ -55,7 +56,11 @@ __all__ = [
     "CoplanarRig",
     "Intersection",
     "LineAxes",
+    "LineCamera",
+    "Met",
     "ProductFrame",
+    "RawPair",
+    "Seen",
     "aligned_rotation",
     "camera_center_mm",
     "depth_at",

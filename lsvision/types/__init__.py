@@ -25,6 +25,7 @@ from lsvision.types.product import (
     ProductGrid,
     ProductStrip,
 )
+from lsvision.types.raw_rig import RawCamera, RawRig, ViewPlane
 from lsvision.types.scan import (
     Board,
     Depth,
@@ -66,6 +67,8 @@ __all__ = [
     "ProductGrid",
     "ProductStrip",
     "Provenance",
+    "RawCamera",
+    "RawRig",
     "RefusedVerdict",
     "Rig",
     "Scan",
@@ -75,5 +78,6 @@ __all__ = [
     "Transport",
     "Travel",
     "Verdict",
+    "ViewPlane",
     "missing_ranges",
 ]

@@ -1,0 +1,132 @@
+"""A pair of raw line cameras: where they see a moving object, and where on it their rays meet.
+
+A column u of a camera has t = (u - c) / f; its ray leaves at the angle atan(t (1 + k1 t² + k2 t⁴)) + turn from Z, so
+that it has the slope dx/dz of that angle's tangent. The left camera sees what crosses the plane Y = 0, the right one
+what crosses Y = s0 + s1 (x - B/2) + s2 (z - z0). A point of the object at P on line 0 is at P - y n after the travel y.
+
+Source: the distortion of Brown 1971, along the one axis of a line; the motion of Wang et al. 2024, Eq. 10-11.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from lsvision.types import RawCamera, RawRig
+
+_INVERSIONS = 6  # Newton steps of the distortion's inverse: from 0.1 of distortion on, rounding is left
+
+
+@dataclass(frozen=True)
+class LineCamera:
+    """The optics of one or many line cameras as tensors: f and c in px, the turn in rad, k1 and k2."""
+
+    focal_px: Float[Tensor, "*batch"]
+    principal_px: Float[Tensor, "*batch"]
+    turn: Float[Tensor, "*batch"]
+    k1: Float[Tensor, "*batch"]
+    k2: Float[Tensor, "*batch"]
+
+    @classmethod
+    def of(cls, camera: RawCamera, pixel_pitch_um: float) -> "LineCamera":
+        """Those of a camera, float64."""
+        focal_px = camera.focal_length_mm / (pixel_pitch_um * 1e-3)
+        values = (focal_px, camera.principal_px, camera.turn_rad, *camera.distortion)
+        return cls(*torch.tensor(values, dtype=torch.float64))
+
+    def slope(self, column: Float[Tensor, "*columns"]) -> Float[Tensor, "*columns"]:
+        """Slope dx/dz of the ray of a column, px."""
+        t = (column - self.principal_px) / self.focal_px
+        return torch.tan(torch.atan(self._distorted(t)) + self.turn)
+
+    def column(self, slope: Float[Tensor, "*columns"]) -> Float[Tensor, "*columns"]:
+        """Column, px, that looks along a slope dx/dz: the inverse of ``slope``, by Newton's method."""
+        distorted = torch.tan(torch.atan(slope) - self.turn)
+        t = distorted
+        for _ in range(_INVERSIONS):
+            square = t.square()
+            growth = 1 + square * (3 * self.k1 + 5 * self.k2 * square)
+            t = t - (self._distorted(t) - distorted) / growth
+        return t * self.focal_px + self.principal_px
+
+    def _distorted(self, t: Tensor) -> Tensor:
+        square = t.square()
+        return t * (1 + square * (self.k1 + self.k2 * square))
+
+
+@dataclass(frozen=True)
+class Seen:
+    """Where a camera sees a point: the column, px, and the nominal travel of the line, mm."""
+
+    column: Float[Tensor, "*batch"]
+    travel: Float[Tensor, "*batch"]
+
+
+@dataclass(frozen=True)
+class Met:
+    """Where the rays of two columns meet: x and z at the left camera's line, mm, and how much later the right one is.
+
+    ``later_mm`` is the nominal travel from the left camera's line to the right one's.
+    """
+
+    x: Float[Tensor, "*batch"]
+    z: Float[Tensor, "*batch"]
+    later_mm: Float[Tensor, "*batch"]
+
+
+@dataclass(frozen=True)
+class RawPair:
+    """Two line cameras as tensors; ``plane`` is (s0, s1, s2) of the right one, ``z0_mm`` where it counts depth from."""
+
+    left: LineCamera
+    right: LineCamera
+    baseline_mm: Float[Tensor, "*batch"]
+    plane: Float[Tensor, "*batch 3"]
+    z0_mm: Float[Tensor, "*batch"]
+
+    @classmethod
+    def of(cls, rig: RawRig) -> "RawPair":
+        """Those of a rig, float64."""
+        left, right = (LineCamera.of(camera, rig.pixel_pitch_um) for camera in (rig.left, rig.right))
+        view = rig.view_plane
+        baseline, *plane = torch.tensor(
+            [rig.baseline_mm, view.offset_mm, view.slope_x, view.slope_z], dtype=torch.float64
+        )
+        middle = torch.tensor((rig.width_px - 1) / 2, dtype=torch.float64)
+        z0 = baseline / (left.slope(middle) - right.slope(middle))
+        return cls(left, right, baseline, torch.stack(plane), z0)
+
+    def seen_left(self, points: Float[Tensor, "*#batch 3"], n: Float[Tensor, "*#batch 3"]) -> Seen:
+        """Where the left camera sees points P, mm, of an object with the motion n."""
+        travel = points[..., 1] / n[..., 1]
+        x, _, z = (points - travel[..., None] * n).unbind(-1)
+        return Seen(self.left.column(x / z), travel)
+
+    def seen_right(self, points: Float[Tensor, "*#batch 3"], n: Float[Tensor, "*#batch 3"]) -> Seen:
+        """Where the right camera sees points P, mm, of an object with the motion n."""
+        s0, s1, s2 = self.plane.unbind(-1)
+        from_middle = points[..., 0] - self.baseline_mm / 2
+        ahead = points[..., 1] - s0 - s1 * from_middle - s2 * (points[..., 2] - self.z0_mm)
+        travel = ahead / (n[..., 1] - s1 * n[..., 0] - s2 * n[..., 2])
+        x, _, z = (points - travel[..., None] * n).unbind(-1)
+        return Seen(self.right.column((x - self.baseline_mm) / z), travel)
+
+    def meet(
+        self, left_px: Float[Tensor, "*#batch"], right_px: Float[Tensor, "*#batch"], n: Float[Tensor, "*#batch 3"]
+    ) -> Met:
+        """Where on an object of motion n the rays of a left and a right column meet.
+
+        With Δ the travel between them, (z s_L, 0, z) = (B + z' s_R, s0 + .., z') + Δ n; all three are linear in z', the
+        right camera's depth, and Δ.
+        """
+        s0, s1, s2 = self.plane.unbind(-1)
+        of_left, of_right = self.left.slope(left_px), self.right.slope(right_px)
+        drift_x, drift_z = n[..., 0] / n[..., 1], n[..., 2] / n[..., 1]
+        # Of the right camera's plane along its ray: Y = constant + by_depth z'.
+        constant, by_depth = s0 + s1 * self.baseline_mm / 2 - s2 * self.z0_mm, s1 * of_right + s2
+        lever = of_left * drift_z - drift_x
+        z_right = (self.baseline_mm + constant * lever) / (of_left - of_right - by_depth * lever)
+        later = -(constant + by_depth * z_right) / n[..., 1]
+        z = z_right + later * n[..., 2]
+        return Met(of_left * z, z, later)

@@ -1,0 +1,130 @@
+"""The file of a raw pair of cameras: ``rig.yaml`` of the format lsvision-rig/2."""
+
+import math
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Literal
+
+import yaml
+
+from lsvision.errors import FileFormatError
+from lsvision.io.atomic import write_text
+from lsvision.io.formats.rig import ColorSpacing
+from lsvision.io.formats.validation import read_entries, read_yaml
+from lsvision.schema import AcuteAngle, Checked, NonNegative, Positive, PositiveInt
+from lsvision.types import RawCamera, RawRig, ViewPlane
+
+RawRigFormat = Literal["lsvision-rig/2"]
+RAW_RIG_FORMAT: RawRigFormat = "lsvision-rig/2"
+_OF_CAMERA = ("focal_length_mm", "principal_point_px", "distortion.0", "distortion.1")
+# What ``sigma`` may name, as it stands in the file. The left camera's turn is where the scan frame is.
+RIG_QUANTITIES = (
+    *(f"left.{name}" for name in _OF_CAMERA),
+    *(f"right.{name}" for name in (*_OF_CAMERA, "turn_deg")),
+    "baseline_mm",
+    *(f"right.view_plane.{name}" for name in ("offset_mm", "slope_x", "slope_z")),
+)
+
+
+@dataclass(frozen=True)
+class RawCameraEntries(Checked):
+    """Entry ``left``, and what ``right`` has in common with it."""
+
+    focal_length_mm: Positive
+    principal_point_px: float
+    turn_deg: AcuteAngle = 0.0
+    distortion: tuple[float, float] = (0.0, 0.0)
+
+    def camera(self) -> RawCamera:
+        """The camera that they describe."""
+        turn = math.radians(self.turn_deg)
+        return RawCamera(self.focal_length_mm, self.principal_point_px, turn, self.distortion)
+
+
+@dataclass(frozen=True)
+class RightCameraEntries(RawCameraEntries):
+    """Entry ``right``: the plane that it looks at, seen from the left camera's, too."""
+
+    view_plane: ViewPlane = field(default_factory=ViewPlane)
+
+
+@dataclass(frozen=True)
+class RawRigEntries(Checked):
+    """The entries of ``rig.yaml``; ``sigma`` holds what is known of the quantities named in ``RIG_QUANTITIES``."""
+
+    format: RawRigFormat
+    width_px: PositiveInt
+    pixel_pitch_um: Positive
+    baseline_mm: Positive
+    left: RawCameraEntries
+    right: RightCameraEntries
+    color_spacing_lines: ColorSpacing | None = None
+    sigma: dict[str, NonNegative] | None = None
+
+    def rig(self) -> RawRig:
+        """The rig that they describe."""
+        spacing = self.color_spacing_lines or ColorSpacing(0.0, 0.0, 0.0)
+        return RawRig(
+            width_px=self.width_px,
+            pixel_pitch_um=self.pixel_pitch_um,
+            baseline_mm=self.baseline_mm,
+            left=self.left.camera(),
+            right=self.right.camera(),
+            view_plane=self.right.view_plane,
+            color_spacing_lines=(spacing.red, spacing.green, spacing.blue),
+            sigma=tuple(sorted((self.sigma or {}).items())),
+        )
+
+
+def read_raw_rig(path: Path | str) -> RawRig:
+    """Read ``rig.yaml`` of a raw pair.
+
+    Raises:
+        FileFormatError: the file is missing, or an entry is missing, unknown or out of range.
+    """
+    path = Path(path)
+    return raw_rig_from_dict(read_yaml(path), path)
+
+
+def write_raw_rig(rig: RawRig, path: Path | str) -> None:
+    """Write ``rig.yaml`` of a raw pair."""
+    write_text(path, yaml.safe_dump(raw_rig_to_dict(rig), sort_keys=False, default_flow_style=None))
+
+
+def raw_rig_to_dict(rig: RawRig) -> dict[str, object]:
+    """Plain data of a raw rig, as ``rig.yaml`` holds it."""
+    left, right = (
+        {
+            "focal_length_mm": camera.focal_length_mm,
+            "principal_point_px": camera.principal_px,
+            "turn_deg": math.degrees(camera.turn_rad),
+            "distortion": list(camera.distortion),
+        }
+        for camera in (rig.left, rig.right)
+    )
+    spacing = {"color_spacing_lines": asdict(ColorSpacing(*rig.color_spacing_lines))}
+    return {
+        "format": RAW_RIG_FORMAT,
+        "width_px": rig.width_px,
+        "pixel_pitch_um": rig.pixel_pitch_um,
+        "baseline_mm": rig.baseline_mm,
+        "left": left,
+        "right": {**right, "view_plane": asdict(rig.view_plane)},
+        **(spacing if any(rig.color_spacing_lines) else {}),
+        **({"sigma": dict(rig.sigma)} if rig.sigma else {}),
+    }
+
+
+def raw_rig_from_dict(data: object, path: Path, where: str = "") -> RawRig:
+    """Check the plain data of a raw rig and make the rig; see ``rig_from_dict``.
+
+    Raises:
+        FileFormatError: an entry is missing, unknown or out of range; the cameras do not look at one point in front.
+    """
+    entries = read_entries(RawRigEntries, data, path, where)
+    unknown = set(entries.sigma or {}) - set(RIG_QUANTITIES)
+    if unknown:
+        raise FileFormatError(
+            path, f"unknown key; the quantities are {', '.join(RIG_QUANTITIES)}", f"sigma.{min(unknown)}"
+        )
+    return entries.rig()
