@@ -11,7 +11,7 @@ PACKAGE = Path(__file__).parents[1] / "lsvision"
 CAMERA_FIELDS = {"focal_length_mm", "pixel_pitch_um", "baseline_mm", "principal_left_px", "principal_right_px"}
 GEOMETRY_ONLY = {"product_axes", "focal_length_px"}
 # They define the fields, and write and read them.
-NAMES_FIELDS = {"types/scan.py", "io/formats/raw_rig.py", "io/formats/rig.py"}
+NAMES_FIELDS = {"types/raw_rig.py", "types/scan.py", "io/formats/raw_rig.py", "io/formats/rig.py"}
 
 Function = ast.FunctionDef | ast.AsyncFunctionDef
 

@@ -41,7 +41,7 @@ from lsvision.geometry.product_axes import (
     product_pose,
     to_product,
 )
-from lsvision.geometry.raw_pair import LineCamera, Met, RawPair, Seen
+from lsvision.geometry.raw_pair import LineCamera, Met, RawPair, Seen, quantities_of, with_quantities
 from lsvision.geometry.rigid import (
     euler_angles,
     fit_rigid,
@@ -82,6 +82,7 @@ __all__ = [
     "product_axes",
     "product_pose",
     "project",
+    "quantities_of",
     "rotation_from_vector",
     "scaled_rig",
     "scan_position",
@@ -99,6 +100,7 @@ __all__ = [
     "triangulation_jacobian",
     "uneven_travel",
     "vector_from_rotation",
+    "with_quantities",
     "without_trend",
     "zero_disparity_mm",
 ]

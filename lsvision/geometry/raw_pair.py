@@ -7,15 +7,37 @@ what crosses Y = s0 + s1 (x - B/2) + s2 (z - z0). A point of the object at P on 
 Source: the distortion of Brown 1971, along the one axis of a line; the motion of Wang et al. 2024, Eq. 10-11.
 """
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from lsvision.types import RawCamera, RawRig
+from lsvision.types import RawCamera, RawRig, ViewPlane
 
 _INVERSIONS = 6  # Newton steps of the distortion's inverse: from 0.1 of distortion on, rounding is left
+
+
+def quantities_of(rig: RawRig) -> Float[Tensor, " quantities"]:
+    """The quantities of a rig in the order and units of ``RIG_QUANTITIES``, float64."""
+    left, right, view = rig.left, rig.right, rig.view_plane
+    values = [
+        *(left.focal_length_mm, left.principal_px, *left.distortion),
+        *(right.focal_length_mm, right.principal_px, *right.distortion, math.degrees(right.turn_rad)),
+        *(rig.baseline_mm, view.offset_mm, view.slope_x, view.slope_z),
+    ]
+    return torch.tensor(values, dtype=torch.float64)
+
+
+def with_quantities(rig: RawRig, quantities: Float[Tensor, " quantities"]) -> RawRig:
+    """The rig with other quantities; its view plane then counts depth from its own z0."""
+    focal_l, c_l, k1_l, k2_l, focal_r, c_r, k1_r, k2_r, turn_r, baseline, s0, s1, s2 = quantities.tolist()
+    left = replace(rig.left, focal_length_mm=focal_l, principal_px=c_l, distortion=(k1_l, k2_l))
+    right = RawCamera(focal_r, c_r, math.radians(turn_r), (k1_r, k2_r))
+    own = replace(rig, baseline_mm=baseline, left=left, right=right, view_plane=ViewPlane(s0, s1, s2))
+    moved = s2 * float(RawPair.of(own).z0_mm - RawPair.of(rig).z0_mm)
+    return replace(own, view_plane=ViewPlane(s0 + moved, s1, s2))
 
 
 @dataclass(frozen=True)
@@ -27,13 +49,6 @@ class LineCamera:
     turn: Float[Tensor, "*batch"]
     k1: Float[Tensor, "*batch"]
     k2: Float[Tensor, "*batch"]
-
-    @classmethod
-    def of(cls, camera: RawCamera, pixel_pitch_um: float) -> "LineCamera":
-        """Those of a camera, float64."""
-        focal_px = camera.focal_length_mm / (pixel_pitch_um * 1e-3)
-        values = (focal_px, camera.principal_px, camera.turn_rad, *camera.distortion)
-        return cls(*torch.tensor(values, dtype=torch.float64))
 
     def slope(self, column: Float[Tensor, "*columns"]) -> Float[Tensor, "*columns"]:
         """Slope dx/dz of the ray of a column, px."""
@@ -86,16 +101,25 @@ class RawPair:
     z0_mm: Float[Tensor, "*batch"]
 
     @classmethod
-    def of(cls, rig: RawRig) -> "RawPair":
-        """Those of a rig, float64."""
-        left, right = (LineCamera.of(camera, rig.pixel_pitch_um) for camera in (rig.left, rig.right))
-        view = rig.view_plane
-        baseline, *plane = torch.tensor(
-            [rig.baseline_mm, view.offset_mm, view.slope_x, view.slope_z], dtype=torch.float64
-        )
-        middle = torch.tensor((rig.width_px - 1) / 2, dtype=torch.float64)
-        z0 = baseline / (left.slope(middle) - right.slope(middle))
-        return cls(left, right, baseline, torch.stack(plane), z0)
+    def of(cls, rig: RawRig, quantities: Float[Tensor, "*batch quantities"] | None = None) -> "RawPair":
+        """Those of a rig, float64, or of rigs with other quantities, in the order of ``RIG_QUANTITIES``.
+
+        The planes of all count depth from that of the rig itself.
+        """
+        values = quantities_of(rig) if quantities is None else quantities
+        focal_l, c_l, k1_l, k2_l, focal_r, c_r, k1_r, k2_r, turn_r, baseline, *plane = values.unbind(-1)
+        pitch_mm = rig.pixel_pitch_um * 1e-3
+        turn_l = torch.full_like(turn_r, rig.left.turn_rad)
+        left = LineCamera(focal_l / pitch_mm, c_l, turn_l, k1_l, k2_l)
+        right = LineCamera(focal_r / pitch_mm, c_r, turn_r.deg2rad(), k1_r, k2_r)
+        own = cls(left, right, baseline, torch.stack(plane, dim=-1), baseline)
+        z0 = own.crossing_mm((rig.width_px - 1) / 2) if quantities is None else RawPair.of(rig).z0_mm
+        return replace(own, z0_mm=z0.expand_as(baseline))
+
+    def crossing_mm(self, column: float) -> Float[Tensor, "*batch"]:
+        """Depth z, mm, where the same column of both cameras looks at the same point."""
+        at = torch.full_like(self.baseline_mm, column)
+        return self.baseline_mm / (self.left.slope(at) - self.right.slope(at))
 
     def seen_left(self, points: Float[Tensor, "*#batch 3"], n: Float[Tensor, "*#batch 3"]) -> Seen:
         """Where the left camera sees points P, mm, of an object with the motion n."""

@@ -25,7 +25,7 @@ from lsvision.types.product import (
     ProductGrid,
     ProductStrip,
 )
-from lsvision.types.raw_rig import RawCamera, RawRig, ViewPlane
+from lsvision.types.raw_rig import RIG_QUANTITIES, RawCamera, RawRig, ViewPlane
 from lsvision.types.scan import (
     Board,
     Depth,
@@ -45,6 +45,7 @@ from lsvision.types.scan import (
 
 __all__ = [
     "LINE_COMPONENTS",
+    "RIG_QUANTITIES",
     "Board",
     "BoardCorners",
     "BoardFit",
