@@ -16,28 +16,36 @@ from torch import Tensor
 
 from lsvision.types import RawCamera, RawRig, ViewPlane
 
+_OPTICS = 5  # quantities of a camera
 _INVERSIONS = 6  # Newton steps of the distortion's inverse: from 0.1 of distortion on, rounding is left
 
 
 def quantities_of(rig: RawRig) -> Float[Tensor, " quantities"]:
     """The quantities of a rig in the order and units of ``RIG_QUANTITIES``, float64."""
-    left, right, view = rig.left, rig.right, rig.view_plane
-    values = [
-        *(left.focal_length_mm, left.principal_px, *left.distortion),
-        *(right.focal_length_mm, right.principal_px, *right.distortion, math.degrees(right.turn_rad)),
-        *(rig.baseline_mm, view.offset_mm, view.slope_x, view.slope_z),
-    ]
+    cameras, view = (rig.left, rig.right), rig.view_plane
+    values = [rig.baseline_mm, view.offset_mm, view.slope_x, view.slope_z]
+    for camera in reversed(cameras):
+        optics = (camera.focal_length_mm, camera.principal_px, math.degrees(camera.turn_rad), *camera.distortion)
+        values = [*optics, *values]
     return torch.tensor(values, dtype=torch.float64)
 
 
 def with_quantities(rig: RawRig, quantities: Float[Tensor, " quantities"]) -> RawRig:
     """The rig with other quantities; its view plane then counts depth from its own z0."""
-    focal_l, c_l, k1_l, k2_l, focal_r, c_r, k1_r, k2_r, turn_r, baseline, s0, s1, s2 = quantities.tolist()
-    left = replace(rig.left, focal_length_mm=focal_l, principal_px=c_l, distortion=(k1_l, k2_l))
-    right = RawCamera(focal_r, c_r, math.radians(turn_r), (k1_r, k2_r))
-    own = replace(rig, baseline_mm=baseline, left=left, right=right, view_plane=ViewPlane(s0, s1, s2))
-    moved = s2 * float(RawPair.of(own).z0_mm - RawPair.of(rig).z0_mm)
-    return replace(own, view_plane=ViewPlane(s0 + moved, s1, s2))
+    left, right, (baseline, s0, s1, s2) = quantities.split([_OPTICS, _OPTICS, 4])
+    own = replace(
+        rig,
+        baseline_mm=float(baseline),
+        left=_raw_camera(*left.tolist()),
+        right=_raw_camera(*right.tolist()),
+        view_plane=ViewPlane(float(s0), float(s1), float(s2)),
+    )
+    moved = float(s2 * (RawPair.of(own).z0_mm - RawPair.of(rig).z0_mm))
+    return replace(own, view_plane=replace(own.view_plane, offset_mm=float(s0) + moved))
+
+
+def _raw_camera(focal_length_mm: float, principal_px: float, turn_deg: float, k1: float, k2: float) -> RawCamera:
+    return RawCamera(focal_length_mm, principal_px, math.radians(turn_deg), (k1, k2))
 
 
 @dataclass(frozen=True)
@@ -107,11 +115,9 @@ class RawPair:
         The planes of all count depth from that of the rig itself.
         """
         values = quantities_of(rig) if quantities is None else quantities
-        focal_l, c_l, k1_l, k2_l, focal_r, c_r, k1_r, k2_r, turn_r, baseline, *plane = values.unbind(-1)
-        pitch_mm = rig.pixel_pitch_um * 1e-3
-        turn_l = torch.full_like(turn_r, rig.left.turn_rad)
-        left = LineCamera(focal_l / pitch_mm, c_l, turn_l, k1_l, k2_l)
-        right = LineCamera(focal_r / pitch_mm, c_r, turn_r.deg2rad(), k1_r, k2_r)
+        left, right, (baseline, *plane) = (part.unbind(-1) for part in values.split([_OPTICS, _OPTICS, 4], dim=-1))
+        to_px = 1.0 / (rig.pixel_pitch_um * 1e-3)
+        left, right = (LineCamera(f * to_px, c, turn.deg2rad(), k1, k2) for f, c, turn, k1, k2 in (left, right))
         own = cls(left, right, baseline, torch.stack(plane, dim=-1), baseline)
         z0 = own.crossing_mm((rig.width_px - 1) / 2) if quantities is None else RawPair.of(rig).z0_mm
         return replace(own, z0_mm=z0.expand_as(baseline))

@@ -80,10 +80,10 @@ def test_cameras_without_turn_distortion_and_offset_are_a_rectified_pair():
 
 
 def test_other_quantities_make_another_rig():
-    values = quantities_of(RIG) + 1e-3 * torch.rand(13, dtype=torch.float64)
+    values = quantities_of(RIG) + 1e-3 * torch.rand(14, dtype=torch.float64)
     again = quantities_of(with_quantities(RIG, values))
     moved = float(RawPair.of(with_quantities(RIG, values)).z0_mm - RawPair.of(RIG).z0_mm)
-    offset = torch.zeros(13, dtype=torch.float64).index_fill(0, torch.tensor(10), moved * float(values[12]))
+    offset = torch.zeros(14, dtype=torch.float64).index_fill(0, torch.tensor(11), moved * float(values[13]))
     assert torch.allclose(again, values + offset, rtol=0, atol=1e-12)
     body = points(20)
     one, other = (
