@@ -26,6 +26,7 @@ from lsvision.types.product import (
     ProductStrip,
 )
 from lsvision.types.raw_rig import RIG_QUANTITIES, RawCamera, RawRig, ViewPlane
+from lsvision.types.rig_calibration import CameraResiduals, RigBoard, RigCalibration, RigCombination, RigVerdict
 from lsvision.types.scan import (
     Board,
     Depth,
@@ -51,6 +52,7 @@ __all__ = [
     "BoardFit",
     "Calibration",
     "CalibrationMethod",
+    "CameraResiduals",
     "Depth",
     "DepthSource",
     "DepthView",
@@ -72,6 +74,10 @@ __all__ = [
     "RawRig",
     "RefusedVerdict",
     "Rig",
+    "RigBoard",
+    "RigCalibration",
+    "RigCombination",
+    "RigVerdict",
     "Scan",
     "StereoPair",
     "StoredDepth",
