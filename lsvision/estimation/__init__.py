@@ -8,6 +8,7 @@ resonances, ``recentre`` for rotations in a state, ``nis``, ``fisher_information
 checks. ``linalg`` holds the matrix functions that all of them use, and the rule on bits.
 """
 
+from lsvision.estimation.bordered import BorderedFit, BorderedState, bordered_least_squares, shared_information
 from lsvision.estimation.consistency import chi_square_tail, mean_chi_square_band, nees, nis
 from lsvision.estimation.cubature import AffineModel, slr
 from lsvision.estimation.derivative import jacobian
@@ -32,6 +33,8 @@ from lsvision.estimation.state_space_process import Process, matern, oscillation
 __all__ = [
     "NORMAL_OVER_MAD",
     "AffineModel",
+    "BorderedFit",
+    "BorderedState",
     "Directions",
     "Gaussian",
     "Info",
@@ -49,6 +52,7 @@ __all__ = [
     "Track",
     "Update",
     "apply",
+    "bordered_least_squares",
     "chi_square_tail",
     "cramer_rao_bound",
     "filter_sequence",
@@ -71,6 +75,7 @@ __all__ = [
     "principal_directions",
     "product",
     "recentre",
+    "shared_information",
     "slr",
     "smooth",
     "smooth_signals",

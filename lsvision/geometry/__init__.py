@@ -41,7 +41,7 @@ from lsvision.geometry.product_axes import (
     product_pose,
     to_product,
 )
-from lsvision.geometry.raw_pair import LineCamera, Met, RawPair, Seen
+from lsvision.geometry.raw_pair import LineCamera, Met, RawPair, Seen, quantities_of, with_quantities
 from lsvision.geometry.rectification import Rectification, RowShear, ideal_rig, is_rectified
 from lsvision.geometry.rigid import (
     euler_angles,
@@ -87,6 +87,7 @@ __all__ = [
     "product_axes",
     "product_pose",
     "project",
+    "quantities_of",
     "rotation_from_vector",
     "scaled_rig",
     "scan_position",
@@ -104,6 +105,7 @@ __all__ = [
     "triangulation_jacobian",
     "uneven_travel",
     "vector_from_rotation",
+    "with_quantities",
     "without_trend",
     "zero_disparity_mm",
 ]

@@ -7,15 +7,45 @@ what crosses Y = s0 + s1 (x - B/2) + s2 (z - z0). A point of the object at P on 
 Source: the distortion of Brown 1971, along the one axis of a line; the motion of Wang et al. 2024, Eq. 10-11.
 """
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from lsvision.types import RawCamera, RawRig
+from lsvision.types import RawCamera, RawRig, ViewPlane
 
+_OPTICS = 5  # quantities of a camera
 _INVERSIONS = 6  # Newton steps of the distortion's inverse: from 0.1 of distortion on, rounding is left
+
+
+def quantities_of(rig: RawRig) -> Float[Tensor, " quantities"]:
+    """The quantities of a rig in the order and units of ``RIG_QUANTITIES``, float64."""
+    cameras, view = (rig.left, rig.right), rig.view_plane
+    values = [rig.baseline_mm, view.offset_mm, view.slope_x, view.slope_z]
+    for camera in reversed(cameras):
+        optics = (camera.focal_length_mm, camera.principal_px, math.degrees(camera.turn_rad), *camera.distortion)
+        values = [*optics, *values]
+    return torch.tensor(values, dtype=torch.float64)
+
+
+def with_quantities(rig: RawRig, quantities: Float[Tensor, " quantities"]) -> RawRig:
+    """The rig with other quantities; its view plane then counts depth from its own z0."""
+    left, right, (baseline, s0, s1, s2) = quantities.split([_OPTICS, _OPTICS, 4])
+    own = replace(
+        rig,
+        baseline_mm=float(baseline),
+        left=_raw_camera(*left.tolist()),
+        right=_raw_camera(*right.tolist()),
+        view_plane=ViewPlane(float(s0), float(s1), float(s2)),
+    )
+    moved = float(s2 * (RawPair.of(own).z0_mm - RawPair.of(rig).z0_mm))
+    return replace(own, view_plane=replace(own.view_plane, offset_mm=float(s0) + moved))
+
+
+def _raw_camera(focal_length_mm: float, principal_px: float, turn_deg: float, k1: float, k2: float) -> RawCamera:
+    return RawCamera(focal_length_mm, principal_px, math.radians(turn_deg), (k1, k2))
 
 
 @dataclass(frozen=True)
@@ -27,13 +57,6 @@ class LineCamera:
     turn: Float[Tensor, "*batch"]
     k1: Float[Tensor, "*batch"]
     k2: Float[Tensor, "*batch"]
-
-    @classmethod
-    def of(cls, camera: RawCamera, pixel_pitch_um: float) -> "LineCamera":
-        """Those of a camera, float64."""
-        focal_px = camera.focal_length_mm / (pixel_pitch_um * 1e-3)
-        values = (focal_px, camera.principal_px, camera.turn_rad, *camera.distortion)
-        return cls(*torch.tensor(values, dtype=torch.float64))
 
     def slope(self, column: Float[Tensor, "*columns"]) -> Float[Tensor, "*columns"]:
         """Slope dx/dz of the ray of a column, px."""
@@ -86,16 +109,23 @@ class RawPair:
     z0_mm: Float[Tensor, "*batch"]
 
     @classmethod
-    def of(cls, rig: RawRig) -> "RawPair":
-        """Those of a rig, float64."""
-        left, right = (LineCamera.of(camera, rig.pixel_pitch_um) for camera in (rig.left, rig.right))
-        view = rig.view_plane
-        baseline, *plane = torch.tensor(
-            [rig.baseline_mm, view.offset_mm, view.slope_x, view.slope_z], dtype=torch.float64
-        )
-        middle = torch.tensor((rig.width_px - 1) / 2, dtype=torch.float64)
-        z0 = baseline / (left.slope(middle) - right.slope(middle))
-        return cls(left, right, baseline, torch.stack(plane), z0)
+    def of(cls, rig: RawRig, quantities: Float[Tensor, "*batch quantities"] | None = None) -> "RawPair":
+        """Those of a rig, float64, or of rigs with other quantities, in the order of ``RIG_QUANTITIES``.
+
+        The planes of all count depth from that of the rig itself.
+        """
+        values = quantities_of(rig) if quantities is None else quantities
+        left, right, (baseline, *plane) = (part.unbind(-1) for part in values.split([_OPTICS, _OPTICS, 4], dim=-1))
+        to_px = 1.0 / (rig.pixel_pitch_um * 1e-3)
+        left, right = (LineCamera(f * to_px, c, turn.deg2rad(), k1, k2) for f, c, turn, k1, k2 in (left, right))
+        own = cls(left, right, baseline, torch.stack(plane, dim=-1), baseline)
+        z0 = own.crossing_mm((rig.width_px - 1) / 2) if quantities is None else RawPair.of(rig).z0_mm
+        return replace(own, z0_mm=z0.expand_as(baseline))
+
+    def crossing_mm(self, column: float) -> Float[Tensor, "*batch"]:
+        """Depth z, mm, where the same column of both cameras looks at the same point."""
+        at = torch.full_like(self.baseline_mm, column)
+        return self.baseline_mm / (self.left.slope(at) - self.right.slope(at))
 
     def seen_left(self, points: Float[Tensor, "*#batch 3"], n: Float[Tensor, "*#batch 3"]) -> Seen:
         """Where the left camera sees points P, mm, of an object with the motion n."""

@@ -25,7 +25,8 @@ from lsvision.types.product import (
     ProductGrid,
     ProductStrip,
 )
-from lsvision.types.raw_rig import RawCamera, RawRig, ViewPlane
+from lsvision.types.raw_rig import RIG_QUANTITIES, RawCamera, RawRig, ViewPlane
+from lsvision.types.rig_calibration import CameraResiduals, RigBoard, RigCalibration, RigCombination, RigVerdict
 from lsvision.types.scan import (
     Board,
     Depth,
@@ -45,11 +46,13 @@ from lsvision.types.scan import (
 
 __all__ = [
     "LINE_COMPONENTS",
+    "RIG_QUANTITIES",
     "Board",
     "BoardCorners",
     "BoardFit",
     "Calibration",
     "CalibrationMethod",
+    "CameraResiduals",
     "Depth",
     "DepthSource",
     "DepthView",
@@ -71,6 +74,10 @@ __all__ = [
     "RawRig",
     "RefusedVerdict",
     "Rig",
+    "RigBoard",
+    "RigCalibration",
+    "RigCombination",
+    "RigVerdict",
     "Scan",
     "StereoPair",
     "StoredDepth",

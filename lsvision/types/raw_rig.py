@@ -4,6 +4,15 @@ from dataclasses import dataclass, field
 
 from lsvision.schema import Checked, NonNegative, Positive, PositiveInt
 
+_OF_CAMERA = ("focal_length_mm", "principal_point_px", "turn_deg", "distortion.0", "distortion.1")
+# What a rig consists of, by the names and in the units of its file.
+RIG_QUANTITIES = (
+    *(f"left.{name}" for name in _OF_CAMERA),
+    *(f"right.{name}" for name in _OF_CAMERA),
+    "baseline_mm",
+    *(f"right.view_plane.{name}" for name in ("offset_mm", "slope_x", "slope_z")),
+)
+
 
 @dataclass(frozen=True)
 class RawCamera(Checked):

@@ -8,7 +8,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lsvision.geometry import LineCamera, RawPair, slope_at, triangulate
+from lsvision.geometry import LineCamera, RawPair, quantities_of, slope_at, triangulate, with_quantities
 from lsvision.types import Board, RawCamera, RawRig, Rig, ViewPlane
 
 PITCH_UM = 80.0
@@ -41,7 +41,7 @@ def test_a_column_looks_along_its_slope(k1, k2, turn):
 
 
 def test_the_ray_leaves_at_the_stated_angle():
-    camera = LineCamera.of(RIG.left, PITCH_UM)
+    camera = RawPair.of(RIG).left
     t = (700.0 - 446.4) / (114.1 / 0.08)
     angle = math.atan(t * (1 + 0.012 * t**2 - 0.01 * t**4)) + 0.2212
     assert float(camera.slope(numbers(700.0))[0]) == pytest.approx(math.tan(angle), rel=1e-12)
@@ -77,6 +77,20 @@ def test_cameras_without_turn_distortion_and_offset_are_a_rectified_pair():
     assert torch.allclose(met.x, x, rtol=0, atol=1e-10)
     assert torch.allclose(met.z, z, rtol=0, atol=1e-10)
     assert not bool(met.later_mm.any())
+
+
+def test_other_quantities_make_another_rig():
+    values = quantities_of(RIG) + 1e-3 * torch.rand(14, dtype=torch.float64)
+    again = quantities_of(with_quantities(RIG, values))
+    moved = float(RawPair.of(with_quantities(RIG, values)).z0_mm - RawPair.of(RIG).z0_mm)
+    offset = torch.zeros(14, dtype=torch.float64).index_fill(0, torch.tensor(11), moved * float(values[13]))
+    assert torch.allclose(again, values + offset, rtol=0, atol=1e-12)
+    body = points(20)
+    one, other = (
+        pair.seen_right(body, N) for pair in (RawPair.of(RIG, values), RawPair.of(with_quantities(RIG, values)))
+    )
+    assert torch.allclose(one.column, other.column, rtol=0, atol=1e-9)
+    assert torch.allclose(one.travel, other.travel, rtol=0, atol=1e-11)
 
 
 def test_derivatives_pass_through():

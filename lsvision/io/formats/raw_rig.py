@@ -14,18 +14,10 @@ from lsvision.io.atomic import write_text
 from lsvision.io.formats.rig import RIG_FORMAT, ColorSpacing, rig_from_dict
 from lsvision.io.formats.validation import read_entries, read_yaml
 from lsvision.schema import AcuteAngle, Checked, NonNegative, Positive, PositiveInt, shown
-from lsvision.types import RawCamera, RawRig, Rig, ViewPlane
+from lsvision.types import RIG_QUANTITIES, RawCamera, RawRig, Rig, ViewPlane
 
 RawRigFormat = Literal["lsvision-rig/2"]
 RAW_RIG_FORMAT: RawRigFormat = "lsvision-rig/2"
-_OF_CAMERA = ("focal_length_mm", "principal_point_px", "distortion.0", "distortion.1")
-# What ``sigma`` may name, as it stands in the file. The left camera's turn is where the scan frame is.
-RIG_QUANTITIES = (
-    *(f"left.{name}" for name in _OF_CAMERA),
-    *(f"right.{name}" for name in (*_OF_CAMERA, "turn_deg")),
-    "baseline_mm",
-    *(f"right.view_plane.{name}" for name in ("offset_mm", "slope_x", "slope_z")),
-)
 
 
 @dataclass(frozen=True)

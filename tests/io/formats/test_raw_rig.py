@@ -70,7 +70,7 @@ def test_another_makers_file_is_read(shared_data):
         (("left", "distortion"), [0.1, math.inf], r"left.distortion\[1\]: expected a finite number, got inf"),
         (("left", "view_plane"), {}, "left.view_plane: unknown key"),
         (("right", "view_plane"), {"slope_y": 1.0}, "right.view_plane.slope_y: unknown key"),
-        (("sigma", "left.turn_deg"), 0.1, "sigma.left.turn_deg: unknown key; the quantities are left.focal_length_mm"),
+        (("sigma", "left.turn"), 0.1, "sigma.left.turn: unknown key; the quantities are left.focal_length_mm"),
         (("sigma", "baseline_mm"), -0.1, "sigma.baseline_mm: expected a finite number >= 0, got -0.1"),
         (("format",), "lsvision-rig/3", "format: expected 'lsvision-rig/2', got 'lsvision-rig/3'"),
     ],

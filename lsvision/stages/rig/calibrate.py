@@ -1,0 +1,134 @@
+"""Corners in both raw images of board scans -> a calibrated rig: its quantities, what is known of them, what to do."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import torch
+
+from lsvision.errors import CalibrationError
+from lsvision.geometry import RawPair, rotation_from_vector, with_quantities
+from lsvision.stages.rig.advice import next_scan
+from lsvision.stages.rig.config import RigConfig
+from lsvision.stages.rig.height_shape import HeightShape
+from lsvision.stages.rig.held_out import held_out_rms
+from lsvision.stages.rig.model import QUANTITIES, RigPrior
+from lsvision.stages.rig.observability import unobserved
+from lsvision.stages.rig.sightings import CameraSighting, Sightings
+from lsvision.stages.rig.solve import RigSolution, solve_rig
+from lsvision.types import (
+    RIG_QUANTITIES,
+    CameraResiduals,
+    Motion,
+    Pose,
+    RawRig,
+    RigBoard,
+    RigCalibration,
+    RigCombination,
+    RigVerdict,
+)
+
+_LARGEST_NOISE = 3.0  # times the corners' stated sigmas: more is no noise
+
+
+def calibrate_rig(sightings: Sightings, scans: Sequence[str], rig: RawRig, config: RigConfig) -> RigCalibration:
+    """Calibrate a raw rig on boards.
+
+    Args:
+        scans: names of the scans, one per board. rig: that of the data sheet, the prior.
+
+    Raises:
+        CalibrationError: the corners do not determine the boards' poses.
+    """
+    prior = RigPrior.of(rig, config)
+    solution = solve_rig(sightings, prior, config)
+    shared = solution.shared
+    if not bool(shared.vector.isfinite().all() & solution.found.factor.isfinite().all()):
+        raise CalibrationError(f"{', '.join(scans)}: the corners do not determine the boards' poses")
+    shape = HeightShape.of(rig, shared, prior.sigma, config.depth_range_mm)
+    weak = unobserved(solution.whitened_covariance, shape, config.observed_share)
+    advice = next_scan(solution, shape, config.depth_range_mm).in_words
+    verdict, reasons = _verdict(solution, weak, config), _reasons(solution, weak, advice, config)
+    sigma = solution.covariance.diagonal().sqrt().tolist()
+    found = with_quantities(rig, shared.quantities)
+    return RigCalibration(
+        rig=replace(found, sigma=tuple(zip(RIG_QUANTITIES, sigma[:QUANTITIES], strict=True))),
+        motion=Motion(shared.n, solution.covariance[QUANTITIES:, QUANTITIES:]),
+        covariance=solution.covariance,
+        boards=_boards(solution, scans, held_out_rms(solution, config)),
+        residuals=_residuals(solution),
+        noise_scale=float(solution.noise_scale),
+        height_error_um=1e3 * shape.rms_mm(solution.found.factor),
+        unobserved=weak,
+        advice=advice,
+        verdict=verdict,
+        reasons=reasons,
+    )
+
+
+def _verdict(solution: RigSolution, weak: Sequence[RigCombination], config: RigConfig) -> RigVerdict:
+    if not bool(solution.found.converged):
+        return "not converged"
+    if float(solution.noise_scale) > _LARGEST_NOISE:
+        return "inconsistent"
+    return "prior-dominated" if _bending(weak, config) else "determined"
+
+
+def _reasons(solution: RigSolution, weak: Sequence[RigCombination], advice: str, config: RigConfig) -> tuple[str, ...]:
+    """Why the verdict is not ``determined``, in sentences."""
+    reasons = []
+    if not bool(solution.found.converged):
+        reasons.append(f"the estimate had not settled after {int(solution.found.iterations)} iterations")
+    if float(solution.noise_scale) > _LARGEST_NOISE:
+        reasons.append(
+            f"the corners are off by {float(solution.noise_scale):.1f} times their stated sigmas: the object shook, "
+            "its speed changed from scan to scan, or the board or the rig's file is not as stated"
+        )
+    bending = _bending(weak, config)
+    if bending and not reasons:
+        named = "; ".join(f"{item.in_words} (bends heights by {item.bend_um:.2g} um)" for item in bending)
+        reasons += [f"the data sheet says more than the scans of {named}", advice]
+    return tuple(reasons)
+
+
+def _bending(weak: Sequence[RigCombination], config: RigConfig) -> list[RigCombination]:
+    return [combination for combination in weak if combination.bend_um >= config.least_height_um]
+
+
+def _boards(solution: RigSolution, scans: Sequence[str], held_out: Sequence[float | None]) -> tuple[RigBoard, ...]:
+    model, valid = solution.model, solution.sightings.valid
+    own, n = solution.found.state.own, solution.shared.n
+    rotation = rotation_from_vector(own[:, :3]) @ model.start.rotation
+    middle = model.start.translation + own[:, 3:] + model.middle_mm[:, None] * n
+    offset = solution.sightings.board_points[0] - model.body_points[:, 0]  # middle of what was seen, from the origin
+    origin = middle - (rotation @ offset[..., None])[..., 0]
+    rms = (solution.whitened.square().sum((-2, -1)) / (4 * valid.sum(-1)).clamp(min=1)).sqrt()
+    return tuple(
+        RigBoard(
+            scan=name,
+            corners=int(valid[i].sum()),
+            outliers=int(solution.outliers[i]),
+            pose=Pose(rotation[i], origin[i]),
+            rms=float(rms[i]),
+            held_out_rms=held_out[i],
+        )
+        for i, name in enumerate(scans)
+    )
+
+
+def _residuals(solution: RigSolution) -> tuple[CameraResiduals, CameraResiduals]:
+    """What is left of the corners in the left and in the right image."""
+    sightings, predicted = solution.sightings, solution.model.predict(solution.found.state)
+    pair = RawPair.of(solution.model.prior.rig, solution.shared.quantities)
+    depth = pair.meet(predicted.left[..., 0], predicted.right[..., 0], solution.shared.n).z
+    left, right = (
+        _residuals_of(eye, there, depth, sightings.valid)
+        for eye, there in ((sightings.left, predicted.left), (sightings.right, predicted.right))
+    )
+    return left, right
+
+
+def _residuals_of(
+    eye: CameraSighting, predicted: torch.Tensor, depth: torch.Tensor, valid: torch.Tensor
+) -> CameraResiduals:
+    off = torch.where(valid[..., None], eye.position - predicted, torch.nan)
+    return CameraResiduals(predicted[..., 0], depth, off)

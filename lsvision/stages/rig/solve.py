@@ -1,0 +1,115 @@
+"""The posterior of a raw rig, the motion and all poses: one least squares problem.
+
+Corners count by their covariance, the data sheet by its own. A corner far off is left out; where those that remain
+scatter more than their covariance says, it is scaled as they ask.
+"""
+
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from lsvision.estimation import BorderedFit, BorderedState, bordered_least_squares
+from lsvision.stages.rig.config import RigConfig
+from lsvision.stages.rig.model import POSE, SHARED, RigModel, RigPrior, Shared
+from lsvision.stages.rig.sightings import Sightings
+
+_NORMAL_MEDIAN = 3.3567  # median of a chi-square variable of four: a corner has a column and a travel in two images
+_ROUNDS = 10  # of leaving corners out
+_SETTLED = 1.05  # ratio of two scales in a row
+
+
+@dataclass(frozen=True)
+class RigSolution:
+    """The posterior of a batch of problems.
+
+    ``sightings`` are without the corners that were left out, which ``outliers`` counts by board; ``noise_scale`` is on
+    the corners' sigma, at least 1.
+    """
+
+    model: RigModel
+    sightings: Sightings
+    outliers: Int[Tensor, "*batch boards"]
+    found: BorderedFit
+    noise_scale: Float[Tensor, "*batch"]
+
+    @property
+    def shared(self) -> Shared:
+        """Rig and motion."""
+        return self.model.prior.shared(self.found.state.shared)
+
+    @property
+    def whitened_covariance(self) -> Float[Tensor, "*batch shared shared"]:
+        """Covariance of rig and motion in units of the prior's sigmas."""
+        return self.found.factor @ self.found.factor.mT
+
+    @property
+    def covariance(self) -> Float[Tensor, "*batch shared shared"]:
+        """Covariance of rig and motion, in their units."""
+        sigma = self.model.prior.sigma
+        return sigma[:, None] * self.whitened_covariance * sigma
+
+    @property
+    def whitened(self) -> Float[Tensor, "*batch boards corners 4"]:
+        """Residuals of the corners, measured less predicted, in sigmas as stated; zero where a corner was left out."""
+        return corner_residuals(self.model, self.sightings, self.found.state)
+
+
+def solve_rig(sightings: Sightings, prior: RigPrior, config: RigConfig) -> RigSolution:
+    """Estimate rig, motion and poses of a batch of independent problems of equally many boards."""
+    model = RigModel.of(sightings, prior)
+    zeros = sightings.left.position.new_zeros(*sightings.valid.shape[:-1], SHARED)
+    state = BorderedState(zeros[..., 0, :], zeros[..., :POSE])
+    state, kept = _without_outliers(model, sightings, state, config)
+    chi_square = corner_residuals(model, kept, state).square().sum((-3, -2, -1))
+    freedom = 4.0 * kept.valid.sum((-2, -1)) - POSE * sightings.boards
+    scale = (chi_square / freedom.clamp(min=1)).sqrt().clamp(min=1.0)
+    found = fit_rig(model, kept, state, scale, config)
+    return RigSolution(model, kept, sightings.valid.sum(-1) - kept.valid.sum(-1), found, scale)
+
+
+def corner_residuals(
+    model: RigModel, sightings: Sightings, state: BorderedState
+) -> Float[Tensor, "*batch boards corners 4"]:
+    """Corners measured less predicted in sigmas: column and travel in the left and in the right image."""
+    predicted = model.predict(state)
+    rows = [
+        torch.linalg.solve_triangular(eye.factor, (eye.position - there)[..., None], upper=False)[..., 0]
+        for eye, there in ((sightings.left, predicted.left), (sightings.right, predicted.right))
+    ]
+    return torch.where(sightings.valid[..., None], torch.cat(rows, dim=-1), 0.0)
+
+
+def _without_outliers(
+    model: RigModel, sightings: Sightings, state: BorderedState, config: RigConfig
+) -> tuple[BorderedState, Sightings]:
+    """A state that fits the corners that are not far off, and those; their scale is that of the median corner."""
+    kept, scale = sightings, _median_scale(model, sightings, state)
+    for _ in range(_ROUNDS):
+        state = fit_rig(model, kept, state, scale, config).state
+        before, scale = scale, _median_scale(model, kept, state)
+        off = corner_residuals(model, sightings, state).square().sum(-1).sqrt()
+        valid = sightings.valid & (off <= config.outlier_sigma * scale[..., None, None])
+        settled = bool((valid == kept.valid).all() & (before <= _SETTLED * scale).all())
+        kept = replace(kept, valid=valid)
+        if settled:
+            break
+    return state, kept
+
+
+def _median_scale(model: RigModel, sightings: Sightings, state: BorderedState) -> Float[Tensor, "*batch"]:
+    square = corner_residuals(model, sightings, state).square().sum(-1)
+    square = torch.where(sightings.valid, square, torch.nan).flatten(-2)
+    return (square.nanmedian(-1).values / _NORMAL_MEDIAN).sqrt().clamp(min=1.0)
+
+
+def fit_rig(
+    model: RigModel, sightings: Sightings, start: BorderedState, scale: Float[Tensor, "*batch"], config: RigConfig
+) -> BorderedFit:
+    """Estimate rig, motion and poses from corners as they stand, with a noise ``scale`` times their stated sigma."""
+
+    def rows(state: BorderedState) -> Tensor:
+        return corner_residuals(model, sightings, state).flatten(-2) / scale[..., None, None]
+
+    return bordered_least_squares(rows, start, max_iterations=config.max_iterations, tolerance=config.tolerance)
