@@ -16,13 +16,17 @@ from lsvision.types import MissingLines
 
 @dataclass(frozen=True)
 class ScanFiles:
-    """A scan on disk as every worker opens it; ``stamp`` changes with its files, ``lines`` is its length."""
+    """A scan on disk as every worker opens it; ``stamp`` changes with its files, ``lines`` is its length.
+
+    ``n`` is the motion with which the images of a raw rig are rectified; None where there is nothing to rectify.
+    """
 
     path: str
     stamp: str
     lines: int
     repair_encoder: bool
     missing_lines: MissingLines = "refuse"
+    n: tuple[float, ...] | None = None
 
     def check_unchanged(self) -> None:
         """Check that the files are those that were planned.
@@ -60,9 +64,15 @@ def stamp_of(folder: Path) -> str:
     return key_of(stamps)
 
 
-def depth_key(input_sha256: str, config: DisparityConfig, with_sigma: bool, version: str) -> str:
-    """Hash of everything that the depth of a scan's lines depends on."""
-    return key_of(input_sha256, asdict(config), with_sigma, version)
+def depth_key(
+    input_sha256: str, config: DisparityConfig, with_sigma: bool, version: str, n: tuple[float, ...] | None = None
+) -> str:
+    """Hash of everything that the depth of a scan's lines depends on.
+
+    Args:
+        n: the motion with which the images of a raw rig are rectified.
+    """
+    return key_of(input_sha256, asdict(config), with_sigma, version, *(() if n is None else (n,)))
 
 
 def product_key(depth: str, calibration_sha256: str, config: CorrectionConfig, repair_encoder: bool) -> str:

@@ -5,6 +5,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import lru_cache
 
+import torch
+
 from lsvision.archive.identity import ScanFiles
 from lsvision.errors import ScanChangedError
 from lsvision.image.stereo.relation import PairRelation
@@ -57,7 +59,8 @@ def open_scan(files: ScanFiles) -> Scan:
 
 def open_depth(files: ScanFiles, config: DisparityConfig) -> DepthSource:
     """The depth of a scan: its own, or matched where it is read."""
-    return depth_of(open_scan(files), config, _relation(files, config))
+    n = None if files.n is None else torch.tensor(files.n, dtype=torch.float64)
+    return depth_of(open_scan(files), config, _relation(files, config), n)
 
 
 # Measuring it anew for each strip would cost a tenth of matching.

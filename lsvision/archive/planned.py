@@ -10,7 +10,7 @@ from lsvision.archive.line_motion import LineMotionChoice
 from lsvision.archive.sources.calibrations import DatedCalibration, calibration_for
 from lsvision.archive.sources.catalogue import Found
 from lsvision.errors import FileFormatError
-from lsvision.geometry import ProductFrame
+from lsvision.geometry import ProductFrame, Rectification
 from lsvision.io import read_scan
 from lsvision.stages.correction.config import CorrectionConfig
 from lsvision.stages.correction.grid import most_lines, plan_product, source_dtype
@@ -97,7 +97,14 @@ def plan_scan(found: Found, calibrations: Sequence[DatedCalibration], processing
     grid, frame = plan_product(scan, motion, processing.correction), ProductFrame(scan.rig, scan.travel, motion.n)
     return PlannedScan(
         key=found.key,
-        files=ScanFiles(str(found.path), stamp, scan.lines, processing.repair_encoder, processing.missing_lines),
+        files=ScanFiles(
+            str(found.path),
+            stamp,
+            scan.lines,
+            processing.repair_encoder,
+            processing.missing_lines,
+            None if Rectification.of(scan.raw_rig) is None else tuple(motion.n.tolist()),
+        ),
         lines=scan.lines,
         width=scan.rig.width_px,
         matched=isinstance(scan.images, StereoPair),

@@ -36,14 +36,16 @@ class ScanResults:
     def depth_key(self) -> str:
         """That of the depth of its lines."""
         processing, planned = self.processing, self.planned
-        key = depth_key(self.input_sha256, processing.disparity, processing.with_sigma, __version__)
-        return key_of(key, planned.lines, planned.width, processing.missing_lines)
+        key = depth_key(self.input_sha256, processing.disparity, processing.with_sigma, __version__, planned.files.n)
+        # Lines of a raw pair are those of one moment: their rows follow the travel.
+        travel = () if planned.files.n is None else (processing.repair_encoder,)
+        return key_of(key, planned.lines, planned.width, processing.missing_lines, *travel)
 
     @cached_property
     def line_motion_key(self) -> str:
         """That of its motion from line to line, which does not depend on whether the sigma of the depth is stored."""
         processing, planned = self.processing, self.planned
-        depth = depth_key(self.input_sha256, processing.disparity, False, __version__)
+        depth = depth_key(self.input_sha256, processing.disparity, False, __version__, planned.files.n)
         choice, sha256 = processing.line_motion, planned.calibration.sha256
         return key_of(depth, sha256, choice.key, processing.repair_encoder, processing.missing_lines, planned.lines)
 

@@ -51,7 +51,8 @@ def run_motion(settings: MotionSettings, folder: Path) -> None:
     if dated.warning:
         log.warning("%s", dated.warning)
     keep_freed_memory()
-    with _stored_depth(scan, settings.disparity, folder) as depth:
+    matched = depth_of(scan, settings.disparity, n=dated.calibration.motion.n)
+    with _stored_depth(scan, matched, settings.disparity, folder) as depth:
         motion = measured_line_motion(scan, depth, dated.calibration.motion, settings.registration)
         still = ProductFrame(scan.rig, scan.travel, dated.calibration.motion.n)
         steadied = ProductFrame(scan.rig, scan.travel, still.n, None if motion.is_still else motion)
@@ -70,9 +71,8 @@ def run_motion(settings: MotionSettings, folder: Path) -> None:
 
 
 @contextmanager
-def _stored_depth(scan: Scan, config: DisparityConfig, folder: Path) -> Iterator[DepthSource]:
+def _stored_depth(scan: Scan, depth: DepthSource, config: DisparityConfig, folder: Path) -> Iterator[DepthSource]:
     """The depth of a scan, which is read several times: matched once, into a store that is removed at the end."""
-    depth = depth_of(scan, config)
     if isinstance(scan.images, DepthView):
         yield depth
         return

@@ -8,9 +8,10 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from lsvision.errors import ConfigError
 from lsvision.experiments.settings import RunSettings
-from lsvision.geometry import scaled_rig
-from lsvision.io import NewScan, write_scan
+from lsvision.geometry import scaled_raw_rig, scaled_rig
+from lsvision.io import NewScan, read_rig_pair, write_scan
 from lsvision.report.progress import ProgressBars, progress_bars
 from lsvision.schema import Positive, PositiveInt, Scale, Text
 from lsvision.simulation import (
@@ -22,7 +23,7 @@ from lsvision.simulation import (
     Simulation,
     simulate,
 )
-from lsvision.types import Board, Rig, Transport
+from lsvision.types import Board, RawRig, Rig, Transport
 
 log = logging.getLogger(__name__)
 
@@ -34,10 +35,12 @@ class SimulateSettings(RunSettings):
     ``scale`` = 1 is the full camera with the line pitch ``line_pitch_mm``; 4 means a quarter of the pixels at four
     times the pitch. If ``lines`` is None, the scan shows the whole target. ``output`` is the scan folder to write,
     ``scan`` in the run's folder if it is None. With ``depth`` the scan has the true depth map of the left image in
-    place of the right image, like the scans of a camera that computes depth maps.
+    place of the right image, like the scans of a camera that computes depth maps. ``rig_file``, a rig file of either
+    format, takes the place of ``rig``: cameras of lsvision-rig/2 see raw images.
     """
 
     rig: Rig
+    rig_file: Text | None = None
     board: Board
     scene: SceneConfig
     motion: MotionConfig
@@ -53,9 +56,16 @@ class SimulateSettings(RunSettings):
 
 
 def run_simulate(settings: SimulateSettings, folder: Path) -> None:
-    """Render the scene and write it as a scan folder."""
+    """Render the scene and write it as a scan folder.
+
+    Raises:
+        ConfigError: a depth map of raw cameras is asked for.
+    """
+    rig = _scaled_rig(settings)
+    if settings.depth and isinstance(rig, RawRig):
+        raise ConfigError("depth: expected a rectified rig, as cameras that compute depth maps have")
     simulation = simulate(
-        scaled_rig(settings.rig, settings.scale),
+        rig,
         settings.board,
         settings.scene,
         settings.motion,
@@ -70,7 +80,15 @@ def run_simulate(settings: SimulateSettings, folder: Path) -> None:
     target = Path(settings.output) if settings.output else folder / "scan"
     with progress_bars() as bars:
         write_simulation(simulation, target, bars, depth=settings.depth, strip_lines=settings.strip_lines)
-    log.info("wrote %s: %d lines of %d px, %s", target, simulation.lines, simulation.rig.width_px, settings.scene.kind)
+    log.info("wrote %s: %d lines of %d px, %s", target, simulation.lines, simulation.width_px, settings.scene.kind)
+
+
+def _scaled_rig(settings: SimulateSettings) -> Rig | RawRig:
+    """The cameras, with the pixels of the scale."""
+    if settings.rig_file is None:
+        return scaled_rig(settings.rig, settings.scale)
+    pair = read_rig_pair(settings.rig_file)
+    return scaled_rig(pair.rig, settings.scale) if pair.raw is None else scaled_raw_rig(pair.raw, settings.scale)
 
 
 def write_simulation(
@@ -96,6 +114,7 @@ def write_simulation(
             channels=simulation.channels,
             dtype=torch.uint16 if simulation.sensor.bits == 16 else torch.uint8,
             color_registered=simulation.sensor.color_registered,
+            raw_rig=simulation.raw_rig,
             extra_json={"truth.json": simulation.truth()},
         ),
     )

@@ -42,7 +42,7 @@ from lsvision.geometry.product_axes import (
     to_product,
 )
 from lsvision.geometry.raw_pair import LineCamera, Met, RawPair, Seen, quantities_of, with_quantities
-from lsvision.geometry.rectification import Rectification, RowShear, ideal_rig, is_rectified
+from lsvision.geometry.rectification import Rectification, RowShear, ideal_rig, is_rectified, scaled_raw_rig
 from lsvision.geometry.rigid import (
     euler_angles,
     fit_rigid,
@@ -89,6 +89,7 @@ __all__ = [
     "project",
     "quantities_of",
     "rotation_from_vector",
+    "scaled_raw_rig",
     "scaled_rig",
     "scan_position",
     "shaken",

@@ -127,6 +127,11 @@ class RawPair:
         at = torch.full_like(self.baseline_mm, column)
         return self.baseline_mm / (self.left.slope(at) - self.right.slope(at))
 
+    def right_plane(self, x: Float[Tensor, "*#batch"], z: Float[Tensor, "*#batch"]) -> Float[Tensor, "*batch"]:
+        """Y, mm, of the plane that the right camera looks at."""
+        s0, s1, s2 = self.plane.unbind(-1)
+        return s0 + s1 * (x - self.baseline_mm / 2) + s2 * (z - self.z0_mm)
+
     def seen_left(self, points: Float[Tensor, "*#batch 3"], n: Float[Tensor, "*#batch 3"]) -> Seen:
         """Where the left camera sees points P, mm, of an object with the motion n."""
         travel = points[..., 1] / n[..., 1]

@@ -7,14 +7,14 @@ point lies (``RawPair.meet``).
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from lsvision.geometry.camera import Camera, focal_length_px, slope_at
+from lsvision.geometry.camera import Camera, depth_sigma, focal_length_px, slope_at
 from lsvision.geometry.raw_pair import LineCamera, Met, RawPair
 from lsvision.types import RawRig, Rig, ViewPlane
 
@@ -58,13 +58,38 @@ def ideal_rig(raw: RawRig) -> Rig:
     return _with_columns(raw, focal_mm, width, principal, round(principal + focal_px * raw.baseline_mm / z0, _DIGITS))
 
 
+def scaled_raw_rig(raw: RawRig, scale: float | int) -> RawRig:
+    """The same raw cameras with ``scale`` times larger pixels over the same field, as ``scaled_rig``.
+
+    Raises:
+        ValueError: the scale is below 1.
+    """
+    if scale < 1:
+        raise ValueError(f"scale must be at least 1, got {scale}")
+    left, right = (
+        replace(camera, principal_px=(camera.principal_px + 0.5) / scale - 0.5) for camera in (raw.left, raw.right)
+    )
+    red, green, blue = raw.color_spacing_lines
+    scaled = replace(
+        raw,
+        width_px=math.ceil(raw.width_px / scale),
+        pixel_pitch_um=raw.pixel_pitch_um * scale,
+        left=left,
+        right=right,
+        color_spacing_lines=(red / scale, green / scale, blue / scale),
+    )
+    # The middle of the sensor may lie half a pixel elsewhere, and with it the z0 that the plane counts depth from.
+    view, moved = raw.view_plane, float(RawPair.of(scaled).z0_mm - RawPair.of(raw).z0_mm)
+    return replace(scaled, view_plane=replace(view, offset_mm=view.offset_mm + view.slope_z * moved))
+
+
 def _with_columns(raw: RawRig, focal_mm: float, width: int, left_px: float, right_px: float) -> Rig:
     return Rig(width, raw.pixel_pitch_um, focal_mm, raw.baseline_mm, left_px, right_px, raw.color_spacing_lines)
 
 
 @dataclass(frozen=True)
 class RowShear:
-    """By how much travel, mm, the columns of each ideal image are read late, so that both show a point on one row.
+    """By how much travel, mm, the columns of each matched image are read late, so that both show a point on one row.
 
     ``error_mm`` is how far a point of the depths that it was made for lies from that, at most.
     """
@@ -79,11 +104,12 @@ class Rectification:
     """How the raw images of a pair lie over the ideal ones, for an object of motion n.
 
     Attributes:
-        raw: the raw pair. rig: the ideal one. n: motion, mm per nominal mm of travel, float64; the nominal one where it
-            is not known yet.
+        raw: the raw pair. raw_width: columns of its images. rig: the ideal one.
+        n: motion, mm per nominal mm of travel, float64; the nominal one where it is not known yet.
     """
 
     raw: RawPair
+    raw_width: int
     rig: Rig
     n: Float[Tensor, "3"]
 
@@ -93,7 +119,7 @@ class Rectification:
         if raw is None or is_rectified(raw):
             return None
         nominal = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)
-        return cls(RawPair.of(raw), ideal_rig(raw), nominal if n is None else n)
+        return cls(RawPair.of(raw), raw.width_px, ideal_rig(raw), nominal if n is None else n)
 
     def raw_column(self, column: Float[Tensor, "*batch"], camera: Camera = "left") -> Float[Tensor, "*batch"]:
         """Column of a raw image that looks along the ray of an ideal column, px."""
@@ -118,18 +144,40 @@ class Rectification:
         left = slope_at(self.rig, left_px)
         return self.raw.meet_rays(left, slope_at(self.rig, left_px - disparity_px, "right"), self.n)
 
-    def depth(self, disparity_px: Float[Tensor, "rows width"]) -> Float[Tensor, "rows width"]:
-        """Depth z, mm, of the disparities of ideal left columns; NaN where the rays do not meet in front."""
-        columns = torch.arange(disparity_px.shape[1], dtype=torch.float64)
-        of_left = slope_at(self.rig, columns).to(disparity_px)
-        # The difference of both slopes is small beside them.
-        offset = slope_at(self.rig, columns) - slope_at(self.rig, columns, "right")
-        of_right = of_left - (disparity_px / focal_length_px(self.rig) + offset.to(disparity_px))
-        z = self.raw.meet_rays(of_left, of_right, self.n.to(disparity_px)).z
-        return torch.where(z > 0, z, torch.nan)
+    @cached_property
+    def matched_right_columns(self) -> Float[Tensor, " width"]:
+        """Columns of the raw right image that look along the ideal columns of those of the raw left one, float64.
+
+        Read there, the right image has the columns of the left one, and the plane of zero disparity of the ideal pair:
+        the left image need not be resampled along its lines to be matched.
+        """
+        return self.raw_column(self.ideal_left_columns, "right")
+
+    @cached_property
+    def ideal_left_columns(self) -> Float[Tensor, " raw_width"]:
+        """The ideal columns of all columns of the raw left image, float64."""
+        return self.ideal_column(torch.arange(self.raw_width, dtype=torch.float64))
+
+    @cached_property
+    def matched_rig(self) -> Rig:
+        """A pair in front of whose cameras heights have the largest disparities that they have in matched images."""
+        beside = torch.linspace(-_PARTNERS, 1 + _PARTNERS, _COLUMNS, dtype=torch.float64) * self.raw_width
+        growth, rig = float(self.growth(beside, "left").min()), self.rig
+        wide = (rig.principal_right_px - rig.principal_left_px) / growth
+        return replace(
+            rig,
+            width_px=self.raw_width,
+            focal_length_mm=rig.focal_length_mm / growth,
+            principal_right_px=rig.principal_left_px + wide,
+        )
+
+    @cached_property
+    def matched_columns(self) -> "MatchedColumns":
+        """How the columns of the ideal left image turn disparities of matched images into depth."""
+        return MatchedColumns.of(self)
 
     def row_shear(self, disparity_px: tuple[float, float]) -> RowShear | None:
-        """Shear of the rows of both images for points of a range of disparities; None where both planes are one.
+        """Shear of the rows of matched images for points of a range of disparities; None where both planes are one.
 
         Along a row the right image is read ``later_mm`` after the left one, which depends on column and depth. Where
         columns of both images are read late by functions of their own, the difference between partners u and u - d
@@ -137,25 +185,89 @@ class Rectification:
         """
         if not bool(self.raw.plane.any()):
             return None
-        width = self.rig.width_px
+        width = self.raw_width
         columns = torch.linspace(0, width - 1, _COLUMNS, dtype=torch.float64)[:, None]
-        disparity = torch.linspace(*disparity_px, _DEPTHS, dtype=torch.float64)
-        wanted = self.meet(columns, disparity).later_mm
-        partner = (columns - disparity).flatten()
-        seen = (partner >= 0) & (partner <= width - 1)
-        of_left, of_right = (_powers(at, width)[seen] for at in (columns.expand_as(wanted).flatten(), partner))
+        partner = columns - torch.linspace(*disparity_px, _DEPTHS, dtype=torch.float64)
+        of_left, of_right = self.raw.left.slope(columns), self.raw.left.slope(partner) - self.convergence
+        wanted = self.raw.meet_rays(of_left, of_right, self.n).later_mm.flatten()
+        seen = ((partner >= 0) & (partner <= width - 1)).flatten()
+        left, right = (_powers(at.expand_as(partner).flatten(), width)[seen] for at in (columns, partner))
         # Without a constant, the left image is not read late on the whole.
-        both = torch.cat([of_right, -of_left[:, 1:]], dim=-1)
-        solved = torch.linalg.lstsq(both, wanted.flatten()[seen, None], driver="gelsd").solution[:, 0]
-        error = (both @ solved - wanted.flatten()[seen]).abs().max()
+        both = torch.cat([right, -left[:, 1:]], dim=-1)
+        solved = torch.linalg.lstsq(both, wanted[seen, None], driver="gelsd").solution[:, 0]
+        error = (both @ solved - wanted[seen]).abs().max()
         powers = _powers(torch.arange(width, dtype=torch.float64), width)
-        right, left = solved.split([_POWERS, _POWERS - 1])
-        return RowShear(powers[:, 1:] @ left, powers @ right, float(error))
+        of_right, of_left = solved.split([_POWERS, _POWERS - 1])
+        return RowShear(powers[:, 1:] @ of_left, powers @ of_right, float(error))
+
+    @property
+    def convergence(self) -> float:
+        """By how much the slope of an ideal column of the left camera exceeds that of the right one."""
+        return (self.rig.principal_right_px - self.rig.principal_left_px) / focal_length_px(self.rig)
 
     def _camera(self, camera: Camera) -> LineCamera:
         return self.raw.left if camera == "left" else self.raw.right
 
 
+@dataclass(frozen=True)
+class MatchedColumns:
+    """Depth from disparities of matched images, for columns of the ideal left image.
+
+    Of the slope of the right ray, ``slope(U) - convergence`` in the column U of the raw left image that its partner is
+    found at, ``terms`` are Taylor's at U = ``places``, in powers of the disparity: the fourth would be 4e-4 px.
+
+    Attributes:
+        places: columns of the raw left image, px.
+        growth: ideal columns by raw ones, px/px.
+    """
+
+    rectification: Rectification
+    places: Float[Tensor, " width"]
+    growth: Float[Tensor, " width"]
+    of_left: Float[Tensor, " width"]
+    terms: Float[Tensor, "4 width"]
+
+    @classmethod
+    def of(cls, rectification: Rectification) -> "MatchedColumns":
+        """All columns of the ideal left image."""
+        columns = torch.arange(rectification.rig.width_px, dtype=torch.float64)
+        places = rectification.raw_left_columns
+        step = torch.tensor(_TAYLOR_STEP, dtype=torch.float64)
+        least, less, more, most = (rectification.raw.left.slope(places + at * step) for at in (-2, -1, 1, 2))
+        middle = rectification.raw.left.slope(places)
+        terms = [
+            middle - rectification.convergence,
+            (8 * (less - more) + most - least) / (12 * step),  # the partner of disparity d lies at U - d
+            (less - 2 * middle + more) / (2 * step**2),
+            (2 * more - 2 * less + least - most) / (12 * step**3),
+        ]
+        growth = rectification.growth(places, "left")
+        return cls(rectification, places, growth, slope_at(rectification.rig, columns), torch.stack(terms))
+
+    def part(self, columns: slice, like: Tensor) -> "MatchedColumns":
+        """Some of the columns, with the dtype of another tensor; the places stay as they are."""
+        growth, of_left, terms = (values[..., columns].to(like) for values in (self.growth, self.of_left, self.terms))
+        return MatchedColumns(self.rectification, self.places[columns], growth, of_left, terms)
+
+    def depth(self, disparity_px: Float[Tensor, "rows width"]) -> Float[Tensor, "rows width"]:
+        """Depth z, mm; NaN where the rays do not meet in front of the cameras."""
+        of_right = self.terms[3] * disparity_px
+        for term in (self.terms[2], self.terms[1]):
+            of_right.add_(term).mul_(disparity_px)
+        of_right.add_(self.terms[0])
+        of = self.rectification
+        z = of.raw.meet_rays(self.of_left, of_right, of.n.to(disparity_px)).z
+        return torch.where(z > 0, z, torch.nan)
+
+    def depth_sigma(
+        self, z: Float[Tensor, "rows width"], disparity_sigma_px: Float[Tensor, "rows width"]
+    ) -> Float[Tensor, "rows width"]:
+        """Standard deviation of depths z, mm, from that of their disparities in matched images."""
+        return depth_sigma(self.rectification.rig, z, disparity_sigma_px * self.growth)
+
+
+_PARTNERS = 0.05  # of a line, by which partners may lie beside it
+_TAYLOR_STEP = 50.0  # px, of the differences that give Taylor's terms
 _POWERS = 5  # of the polynomials of a shear
 _COLUMNS, _DEPTHS = 65, 9  # at which it is fitted
 

@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float, Shaped
 from torch import Tensor
 
 from lsvision.image.brightness import gray, sampled_lines, white_level
+from lsvision.image.resampled import ResampledImage
 from lsvision.types import LineImage, StereoPair
 
 _NO_CODE = 2**32
@@ -71,7 +72,7 @@ class CameraLevels:
 
 @dataclass(frozen=True)
 class PairLevels:
-    """Levels of a scan's two cameras; ``white`` is the value that becomes 255 in both."""
+    """Levels of a scan's two cameras, of the images as they took them; ``white`` is what becomes 255 in both."""
 
     white: float
     left: CameraLevels
@@ -80,8 +81,14 @@ class PairLevels:
     @classmethod
     def of(cls, pair: StereoPair) -> "PairLevels":
         """Read the levels of both images."""
-        white = white_level(pair.left, pair.right)
-        return cls(white, CameraLevels.of(pair.left, white), CameraLevels.of(pair.right, white))
+        left, right = (_as_taken(image) for image in (pair.left, pair.right))
+        white = white_level(left, right)
+        return cls(white, CameraLevels.of(left, white), CameraLevels.of(right, white))
+
+
+def _as_taken(image: LineImage) -> LineImage:
+    """An image as the camera took it: of codes that are interpolated nothing can be read."""
+    return image.source if isinstance(image, ResampledImage) else image
 
 
 def _deciding_channel(values: Shaped[Tensor, "lines width channels"]) -> int:

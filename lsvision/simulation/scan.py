@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from lsvision.errors import ConfigError
-from lsvision.geometry import Camera, project
+from lsvision.geometry import Camera, RawPair, camera_center_mm, ideal_rig, project
 from lsvision.schema import Checked, Positive, PositiveInt
 from lsvision.simulation.config import EncoderConfig, MotionConfig, SceneConfig, SensorConfig
 from lsvision.simulation.noise import lattice_hash
@@ -18,7 +18,7 @@ from lsvision.simulation.scene import build_scene, place, scene_lines
 from lsvision.simulation.sensor import expose, halo_px, integrate, sample_offsets
 from lsvision.simulation.surfaces import Look, Scene
 from lsvision.simulation.trajectory import Trajectory, cast_rays
-from lsvision.types import Board, Pose, Rig, Transport, Travel
+from lsvision.types import Board, Pose, RawRig, Rig, Transport, Travel
 
 # Lines rendered at once. Blocks begin at multiples of it, so that strips of every height have the same bits; 32 lines
 # of samples fit the processor's cache.
@@ -51,6 +51,7 @@ class Simulation:
         lines: number of lines.
         travel: as the scan's file states it: the constant pitch, or the encoder's log.
         pose: of the target, ``p = R p_target + T`` in the scan frame.
+        raw_rig: the cameras where they are not rectified; ``rig`` is the ideal pair of those then.
         trajectory: the true motion, vibration and uneven travel included.
     """
 
@@ -62,6 +63,12 @@ class Simulation:
     travel: Travel
     lines: int
     pose: Pose
+    raw_rig: RawRig | None = None
+
+    @property
+    def width_px(self) -> int:
+        """Columns of the images."""
+        return (self.raw_rig or self.rig).width_px
 
     @property
     def channels(self) -> int:
@@ -78,7 +85,7 @@ class Simulation:
 
     def depth_strips(self, strip_lines: int = 256) -> Iterator[Tensor]:
         """Strips ``(h, width)`` of the true depth z, mm, float32, at the centre of every pixel of the left image."""
-        columns = torch.arange(self.rig.width_px, dtype=torch.float64)
+        columns = torch.arange(self.width_px, dtype=torch.float64)
         blocks = (
             self._look("left", columns, torch.arange(first, first + _BLOCK, dtype=torch.float64)).z
             for first in range(0, self.lines, _BLOCK)
@@ -88,15 +95,22 @@ class Simulation:
     def corners(self) -> tuple[Tensor, Tensor]:
         """True pixel positions (column, line) of the board's corners in the left and right image, float64."""
         points = self.board.corner_points() @ self.pose.rotation.mT + self.pose.translation
-        x, line, z = self.trajectory.project(points).unbind(-1)
-        left, right = project(self.rig, x, z)
-        return torch.stack([left, line], dim=-1), torch.stack([right, line], dim=-1)
+        raw = self.trajectory.raw
+        if raw is None:
+            x, line, z = self.trajectory.project(points).unbind(-1)
+            left, right = project(self.rig, x, z)
+            return torch.stack([left, line], dim=-1), torch.stack([right, line], dim=-1)
+        (x, line, z), (right_x, right_line, right_z) = (
+            self.trajectory.project(points, camera).unbind(-1) for camera in ("left", "right")
+        )
+        right = raw.right.column((right_x - camera_center_mm(self.rig, "right")) / right_z)
+        return torch.stack([raw.left.column(x / z), line], dim=-1), torch.stack([right, right_line], dim=-1)
 
     def truth(self) -> dict[str, Any]:
         """The truth of the scan as plain values for a JSON file.
 
-        ``n``, ``stretch``, ``R``, ``T``, ``lines``, the settings under ``args``, and for a board its corners as
-        (column, line) in the order of ``Board.corner_points``.
+        ``n``, ``stretch``, ``R``, ``T``, ``lines``, the settings under ``args``, ``rig`` of raw cameras, and
+        for a board its corners as (column, line) in the order of ``Board.corner_points``.
         """
         trajectory = self.trajectory
         args = {
@@ -115,6 +129,8 @@ class Simulation:
             "lines": self.lines,
             "args": args,
         }
+        if self.raw_rig is not None:
+            truth["rig"] = dataclasses.asdict(self.raw_rig)
         if self.scene.kind == "board":
             left, right = self.corners()
             truth |= {"corners_left_px": left.tolist(), "corners_right_px": right.tolist()}
@@ -126,7 +142,7 @@ class Simulation:
 
     def _expose_block(self, camera: Camera, first: int) -> Tensor:
         reach = halo_px(self.sensor)
-        columns = sample_offsets(-reach, self.rig.width_px + 2 * reach, self.sensor)
+        columns = sample_offsets(-reach, self.width_px + 2 * reach, self.sensor)
         lines = sample_offsets(first - reach, _BLOCK + 2 * reach, self.sensor)
         light = integrate(self._look(camera, columns, lines).color, self.sensor)
         seed = lattice_hash(torch.tensor(first), int(camera == "right"), self.sensor.seed)
@@ -149,7 +165,7 @@ class Simulation:
 
 
 def simulate(
-    rig: Rig,
+    rig: Rig | RawRig,
     board: Board,
     scene: SceneConfig,
     motion: MotionConfig,
@@ -159,7 +175,7 @@ def simulate(
     """Set up a scan of a board, sheet or rail.
 
     Args:
-        rig: the cameras.
+        rig: the cameras, a rectified pair or a raw one.
         board: the target if ``scene.kind`` is "board".
         scene, motion, sensor: the object, how it moves, and what sees it.
         acquisition: pitch and number of the lines, transport, encoder.
@@ -167,14 +183,15 @@ def simulate(
     Raises:
         ConfigError: an option has a value that no scan can have; the message names it.
     """
-    pitch = acquisition.line_pitch_mm
-    trajectory = Trajectory(rig, motion, acquisition.encoder or EncoderConfig(), pitch, acquisition.transport)
+    pitch, raw_rig = acquisition.line_pitch_mm, rig if isinstance(rig, RawRig) else None
+    rig, raw = (rig, None) if isinstance(rig, Rig) else (ideal_rig(rig), RawPair.of(rig))
+    trajectory = Trajectory(rig, motion, acquisition.encoder or EncoderConfig(), pitch, acquisition.transport, raw)
     lines = acquisition.lines
     if lines is None:
         lines = scene_lines(board, scene, trajectory.n, pitch)
     middle_mm = trajectory.sign * pitch * (lines - 1) / 2
     pose = place(rig, board, scene, trajectory.n, middle_mm)
-    return Simulation(rig, board, scene, sensor, trajectory, _logged_travel(trajectory, lines), lines, pose)
+    return Simulation(rig, board, scene, sensor, trajectory, _logged_travel(trajectory, lines), lines, pose, raw_rig)
 
 
 def _logged_travel(trajectory: Trajectory, lines: int) -> Travel:

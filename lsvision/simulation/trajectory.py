@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from lsvision.geometry import Camera, camera_center_mm, middle_point, shaken, slope_at
+from lsvision.geometry import Camera, RawPair, camera_center_mm, middle_point, shaken, slope_at
 from lsvision.simulation.config import EncoderConfig, MotionConfig
 from lsvision.simulation.noise import lattice_hash
 from lsvision.types import Pose, Rig, Transport
@@ -23,17 +23,22 @@ from lsvision.types import Pose, Rig, Transport
 _X, _Z, _ROLL, _WOBBLE = range(4)
 # Fixed-point steps that invert the uneven travel; each gains a digit or more for any wobble that a log can follow.
 _INVERSION_STEPS = 40
+_CROSSING_STEPS = 8  # each gains two digits where a plane is tilted by half a degree
 
 
 @dataclass(frozen=True)
 class Trajectory:
-    """True motion under a rig: direction, vibration, and the travel of each line."""
+    """True motion under a rig: direction, vibration, and the travel of each line.
+
+    ``raw`` are the cameras where they are not rectified; ``rig`` is the ideal pair of those then.
+    """
 
     rig: Rig
     motion: MotionConfig
     encoder: EncoderConfig
     line_pitch_mm: float
     transport: Transport = "forward"
+    raw: RawPair | None = None
 
     @property
     def n(self) -> Tensor:
@@ -77,9 +82,20 @@ class Trajectory:
             dim=-1,
         )
 
-    def project(self, points: Tensor) -> Tensor:
-        """Places (x mm, line, z mm), ``(*batch, 3)``, where the object's own points, mm, cross the scan plane."""
-        y = points[..., 1].double() / self.n[1]  # neither roll about Y nor dx, dz moves a point along Y
+    def project(self, points: Tensor, camera: Camera = "left") -> Tensor:
+        """Places (x mm, line, z mm), ``(*batch, 3)``, where the object's own points, mm, cross the plane of a camera.
+
+        That is the scan plane, unless the right one of a raw pair looks at another.
+        """
+        crossing = self._crossing(points, torch.zeros_like(points[..., 1]))
+        if self.raw is not None and camera == "right":
+            for _ in range(_CROSSING_STEPS):
+                crossing = self._crossing(points, self.raw.right_plane(crossing[..., 0], crossing[..., 2]))
+        return crossing
+
+    def _crossing(self, points: Tensor, plane_y_mm: Tensor) -> Tensor:
+        """Where the object's own points reach Y, mm, as ``project``."""
+        y = (points[..., 1].double() - plane_y_mm) / self.n[1]  # neither roll about Y nor dx, dz moves a point along Y
         line = self.line_at(y)
         still = (points - y[..., None] * self.n)[..., ::2]
         x, z = shaken(still, pad(self.vibration(line), (0, 1)), self.pivot).unbind(-1)
@@ -140,10 +156,15 @@ def cast_rays(trajectory: Trajectory, camera: Camera, columns: Tensor, lines: Te
         columns, lines: positions, px and lines.
         plane_y_mm: Y of the plane that the sensor line sees; zero except for a trilinear sensor.
     """
-    rig = trajectory.rig
+    rig, raw = trajectory.rig, trajectory.raw
     camera_x = camera_center_mm(rig, camera)
-    middle_slope = slope_at(rig, (rig.width_px - 1) / 2, camera)
-    slope = slope_at(rig, columns.double(), camera) - middle_slope
+    if raw is None:
+        middle_slope = slope_at(rig, (rig.width_px - 1) / 2, camera)
+        slope = slope_at(rig, columns.double(), camera) - middle_slope
+    else:
+        slope = (raw.left if camera == "left" else raw.right).slope(columns.double())
+        middle_slope = float(slope[len(slope) // 2])
+        slope = slope - middle_slope
     dx, dz, roll = trajectory.vibration(lines).unbind(-1)
     cos, sin, zero = torch.cos(roll), torch.sin(roll), torch.zeros_like(roll)
     across = torch.stack([cos, zero, sin], -1)  # columns of the inverse of Rroll
@@ -152,6 +173,11 @@ def cast_rays(trajectory: Trajectory, camera: Camera, columns: Tensor, lines: Te
     from_pivot_x, from_pivot_z = camera_x - pivot[0] - dx, -pivot[2] - dz
     origin = across * from_pivot_x[:, None] + depth * from_pivot_z[:, None] + pivot
     origin = origin + origin.new_tensor([0.0, plane_y_mm, 0.0]) + trajectory.position(lines)[:, None] * trajectory.n
+    if raw is not None and camera == "right":
+        # Along a ray, Y of its plane is linear in z and in the slope.
+        up, none = origin.new_tensor([0.0, 1.0, 0.0]), origin.new_zeros(())
+        origin = origin + up * raw.right_plane(origin.new_tensor(camera_x), none)
+        across, depth = across + up * raw.plane[1], depth + up * raw.plane[2]
     return Rays(slope.float(), origin, across, depth + middle_slope * across, camera_x, middle_slope)
 
 

@@ -79,21 +79,39 @@ def test_columns_there_and_back(camera):
         torch.testing.assert_close(rectification.raw_left_columns, rectification.raw_column(whole))
 
 
-def test_depth_of_disparities_is_where_the_raw_rays_meet():
+def test_disparities_of_matched_columns_mean_where_the_raw_rays_meet():
     rectification = Rectification.of(RAW, N)
     assert rectification is not None
-    points = field(rectification.rig)
-    left, right = rectification.raw.seen_left(points, N), rectification.raw.seen_right(points, N)
-    u = rectification.ideal_column(left.column)
-    disparity = u - rectification.ideal_column(right.column, "right")
-    met = rectification.meet(u, disparity)
-    expected = (points - left.travel[:, None] * N)[:, 2]
-    torch.testing.assert_close(met.z, expected, rtol=0, atol=1e-8)
-    rows = torch.linspace(-165, 165, 9)[:, None].expand(-1, rectification.rig.width_px)
-    columns = torch.arange(rectification.rig.width_px, dtype=torch.float64)
-    exact = rectification.meet(columns, rows.double()).z
-    assert (rectification.depth(rows) - exact).abs().max() < 4e-4  # single precision
-    assert rectification.depth(torch.full_like(rows, -8000.0)).isnan().all()
+    columns, disparity = rectification.matched_columns, torch.linspace(-180, 180, 9, dtype=torch.float64)[:, None]
+    disparity = disparity.expand(-1, rectification.rig.width_px).contiguous()
+    partner = rectification.ideal_column(columns.places - disparity)  # where the matched right image looks
+    right = rectification.raw_column(partner, "right")
+    seen = (right >= 0) & (right <= 7141)
+    met = rectification.raw.meet(columns.places, right, N)
+    exact, single = columns.depth(disparity), columns.part(slice(None), torch.empty(0)).depth(disparity.float())
+    assert (exact - met.z)[seen].abs().max() < 3e-4
+    assert (single - met.z)[seen].abs().max() < 6e-4
+    matched = rectification.matched_right_columns
+    whole = torch.arange(7142, dtype=torch.float64)
+    torch.testing.assert_close(matched, rectification.raw_column(rectification.ideal_column(whole), "right"))
+    step = (columns.depth(disparity + 1e-3) - exact)[4:5] / 1e-3
+    sigma = columns.depth_sigma(exact[4:5], torch.ones_like(exact[4:5]))
+    assert ((sigma + step) / sigma).abs().max() < 0.02
+    assert columns.depth(torch.full_like(disparity, -9000.0)).isnan().all()
+
+
+def test_heights_have_no_larger_disparities_than_the_matched_pair_says():
+    rectification = Rectification.of(RAW)
+    assert rectification is not None
+    rig, whole = rectification.rig, torch.arange(7142, dtype=torch.float64)
+    assert zero_disparity_mm(rectification.matched_rig) == pytest.approx(zero_disparity_mm(rig), rel=1e-12)
+    for height in DEPTHS_MM:
+        ideal = rectification.ideal_column(whole)
+        partner = ideal - disparity_at_height(rig, height)
+        raw = whole - rectification.raw_column(partner)
+        largest = disparity_at_height(rectification.matched_rig, height)
+        assert (raw / largest <= 1.001).all()
+        assert (raw / largest).max() > 0.98
 
 
 @pytest.mark.parametrize("signs", [(1, 1), (1, -1), (-1, 1), (0, 1), (1, 0)])
@@ -101,17 +119,18 @@ def test_sheared_rows_show_a_point_on_one_row_at_every_depth(signs):
     raw = dataclasses.replace(RAW, view_plane=ViewPlane(0.25, signs[0] * TILT, signs[1] * TILT))
     rectification = Rectification.of(raw, N)
     assert rectification is not None
-    rig, points = rectification.rig, field(rectification.rig)
-    lowest, highest = (disparity_at_height(rig, height) for height in DEPTHS_MM)
+    points = field(rectification.rig)
+    lowest, highest = (disparity_at_height(rectification.matched_rig, height) for height in DEPTHS_MM)
     shear = rectification.row_shear((lowest, highest))
     assert shear is not None
     left, right = rectification.raw.seen_left(points, N), rectification.raw.seen_right(points, N)
-    columns = rectification.ideal_column(left.column), rectification.ideal_column(right.column, "right")
-    seen = (columns[1] >= 0) & (columns[1] <= rig.width_px - 1)
+    # The columns that the raw right image is read in are those of the left one.
+    partner = rectification.raw_column(rectification.ideal_column(right.column, "right"))
     late = [
-        seen_on.travel - at(shift, column)
-        for seen_on, shift, column in zip((left, right), (shear.left_mm, shear.right_mm), columns, strict=True)
+        seen.travel - at(shift, column)
+        for seen, shift, column in ((left, shear.left_mm, left.column), (right, shear.right_mm, partner))
     ]
+    seen = (partner >= 0) & (partner <= 7141)
     error = (late[1] - late[0])[seen].abs().max() / PITCH_MM
     assert error < 0.05
     assert error <= 1.2 * shear.error_mm / PITCH_MM + 1e-3

@@ -12,8 +12,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from lsvision.geometry import ProductFrame
+from lsvision.geometry import ProductFrame, Rectification
 from lsvision.image.missing import missing_mask, missing_near
+from lsvision.image.resampled import ColumnMap
 from lsvision.image.resampling import Sampling, sample_image, sampling_reach
 from lsvision.stages.correction.config import CorrectionConfig
 from lsvision.stages.correction.locate import SeenCells
@@ -35,6 +36,8 @@ class ColorLines:
             which a colour shows what green shows on each line. Both are None where all colours look at one line.
         registered: rows by which the camera has shifted each colour: row less ``registered`` is the line that it was
             taken on.
+        raw_columns: where the columns of the ideal left image, in which cells are located, lie in the raw one; None
+            where the image is rectified.
     """
 
     frame: ProductFrame
@@ -44,6 +47,7 @@ class ColorLines:
     shift_mm: Tensor | None = None
     rows: Tensor | None = None
     registered: Sequence[float] = ()
+    raw_columns: ColumnMap | None = None
 
     def sample(self, image: Tensor, seen: SeenCells, out: Tensor) -> None:
         """Write the colours of cells, ``(rows, columns, channels)``, to ``out``.
@@ -53,7 +57,8 @@ class ColorLines:
         """
         if self.shift_mm is None or self.rows is None:
             first_line = seen.first_line - self.image_range[0]
-            sample_image(image, seen.column, seen.line, self.sampling, first_line=first_line, out=out)
+            column = self.in_image(seen.column)
+            sample_image(image, column, seen.line, self.sampling, first_line=first_line, out=out)
             return
         begin = seen.first_line - self.start
         base = seen.line.nan_to_num().floor().clamp(-begin, self.rows.shape[1] - 2 - begin)
@@ -63,9 +68,13 @@ class ColorLines:
         for channel, (shift_mm, rows) in enumerate(zip(self.shift_mm, self.rows - self.image_range[0], strict=True)):
             row, into = torch.lerp(rows[base], rows[base + 1], part), torch.empty_like(out[..., :1])
             taken = row + (self.image_range[0] - self.registered[channel])
-            shifted = self.frame.shifted_column(column, relief, shift_mm, (line, taken))
+            shifted = self.in_image(self.frame.shifted_column(column, relief, shift_mm, (line, taken)))
             sample_image(image[..., [channel]], shifted, row, self.sampling, out=into)
             out[..., [channel]] = into
+
+    def in_image(self, column: Tensor) -> Tensor:
+        """Columns of the image that the camera took, px."""
+        return column if self.raw_columns is None else self.raw_columns(column)
 
 
 def sampling_for(config: CorrectionConfig, spacing: tuple[float, float]) -> Sampling:
@@ -78,14 +87,16 @@ def color_lines(scan: Scan, frame: ProductFrame, lines: tuple[int, int], samplin
     """Colours of the lines ``lines[0]..lines[1]-1``."""
     reach = sampling_reach(sampling.coarser[0])
     shift = _spacing(scan)
+    rectification = Rectification.of(scan.raw_rig)
+    raw_columns = None if rectification is None else ColumnMap(rectification.raw_left_columns)
     if shift is None:
         image_range = max(lines[0] - reach, 0), min(lines[1] + reach, scan.lines)
-        return ColorLines(frame, lines[0], image_range, sampling)
+        return ColorLines(frame, lines[0], image_range, sampling, raw_columns=raw_columns)
     shift_mm, rows = shift * scan.travel.line_pitch_mm, _color_rows(scan, frame, lines, shift)
     registered = _registered(scan, shift).tolist()
     first, last = math.floor(float(rows.min())) - reach, math.ceil(float(rows.max())) + reach + 1
     image_range = min(max(first, 0), scan.lines - 1), max(min(last, scan.lines), 1)
-    return ColorLines(frame, lines[0], image_range, sampling, shift_mm, rows, registered)
+    return ColorLines(frame, lines[0], image_range, sampling, shift_mm, rows, registered, raw_columns)
 
 
 def lines_without_colors(scan: Scan, frame: ProductFrame, sampling: Sampling) -> Bool[Tensor, " lines"]:

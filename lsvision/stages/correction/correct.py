@@ -99,7 +99,7 @@ class Correction:
             seen = self.locator.locate(lines, (rows[0] + tile_rows.start, rows[0] + tile_rows.stop), columns)
             if seen is not None:
                 self._sample_colors(colors, image, seen, strip.color[tile])
-                self._fill_heights(seen, strip, tile)
+                self._fill_heights(colors, seen, strip, tile)
 
         # Where cells are coarse, fewer rows hold as many lines as a place can be counted through.
         size = min(TILE[0], max(1, int(_TILE_LINES / self.locator.spacing[0]))), TILE[1]
@@ -118,13 +118,15 @@ class Correction:
         for part in tiles(len(out), out.shape[1], SAMPLED_TILES[self.config.resampler]):
             colors.sample(image, seen.part(*part), out[part])
 
-    def _fill_heights(self, seen: SeenCells, strip: ProductStrip, tile: tuple[slice, slice]) -> None:
+    def _fill_heights(
+        self, colors: ColorLines, seen: SeenCells, strip: ProductStrip, tile: tuple[slice, slice]
+    ) -> None:
         """Write everything but the colours of a tile to the strip."""
         height = seen.relief + self.frame.height_over_relief_mm
         strip.valid[tile] = seen.measured
         strip.height[tile] = height.masked_fill_(~seen.measured, torch.nan)
         line = seen.line.to(strip.source.dtype) + seen.first_line
-        strip.source[tile][..., 0], strip.source[tile][..., 1] = line, seen.column
+        strip.source[tile][..., 0], strip.source[tile][..., 1] = line, colors.in_image(seen.column)
         if strip.sigma is not None:
             strip.sigma[tile] = self._position_sigma(seen).masked_fill_(~seen.measured[..., None], torch.nan)
 

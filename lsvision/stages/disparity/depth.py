@@ -5,11 +5,14 @@ from dataclasses import dataclass, field
 from functools import cached_property
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from lsvision.geometry import depth_at, depth_sigma
 from lsvision.image.stereo.relation import PairRelation
 from lsvision.stages.disparity.config import DisparityConfig
-from lsvision.stages.disparity.match import measure_block, relation_of
+from lsvision.stages.disparity.match import measure_block, measure_lines, relation_of
+from lsvision.stages.disparity.rectify import RectifiedPair
 from lsvision.types import Depth, DepthSource, DepthView, Rig, Scan, StereoPair, StoredDepth
 
 
@@ -17,8 +20,9 @@ from lsvision.types import Depth, DepthSource, DepthView, Rig, Scan, StereoPair,
 class MatchedDepth:
     """The depth of a stereo scan; the last blocks stay in memory, since neighbouring reads overlap.
 
-    ``known_relation`` of the images is measured where it is not given. The sigma is None where the matcher does not
-    refine: nothing is known about it then.
+    ``known_relation`` of the images is measured where it is not given. ``rectified`` are the images of an ideal pair,
+    which are matched in place of raw ones; None where ``images`` are rectified. The sigma is None where the matcher
+    does not refine: nothing is known about it then.
     """
 
     images: StereoPair
@@ -26,6 +30,7 @@ class MatchedDepth:
     config: DisparityConfig = field(default_factory=DisparityConfig)
     kept_blocks: int = 3
     known_relation: PairRelation | None = None
+    rectified: RectifiedPair | None = None
     _blocks: OrderedDict[int, Depth] = field(default_factory=OrderedDict, init=False, repr=False)
 
     @property
@@ -61,30 +66,52 @@ class MatchedDepth:
         return self.known_relation or relation_of(self.images, self.rig, self.config)
 
     def _match(self, index: int) -> Depth:
-        match = measure_block(self.images, self.relation, self.rig, self.config, index)
-        z = depth_at(self.rig, match.disparity)
-        return Depth(z, depth_sigma(self.rig, z, match.sigma) if self.config.tells_sigma else None)
+        if self.rectified is None:
+            match = measure_block(self.images, self.relation, self.rig, self.config, index)
+            z = depth_at(self.rig, match.disparity)
+            return Depth(z, depth_sigma(self.rig, z, match.sigma) if self.config.tells_sigma else None)
+        start, size = index * self.config.block_lines, self.config.block_lines
+        stop = min(start + size, self.lines)
+        rows = self.rectified.rows_of(start, stop)
+        rig = self.rectified.rectification.matched_rig
+        match = measure_lines(self.rectified.images, self.relation, rig, self.config, rows)
+        depth = self.rectified.depth(match, rows, start, stop)
+        return depth if self.config.tells_sigma else Depth(depth.z)
 
 
 def relation_of_scan(scan: Scan, config: DisparityConfig) -> PairRelation | None:
-    """How the two images of a scan differ apart from disparity; None for a scan with a depth map."""
+    """How the two images of a scan differ apart from disparity; None for a scan with a depth map.
+
+    Raw images are rectified for it as for an object of nominal motion.
+    """
     match scan.images:
         case StereoPair() as pair:
-            return relation_of(pair, scan.rig, config)
+            rectified = RectifiedPair.of(scan, config)
+            if rectified is None:
+                return relation_of(pair, scan.rig, config)
+            return relation_of(rectified.images, rectified.rectification.matched_rig, config)
         case DepthView():
             return None
 
 
 def depth_of(
-    scan: Scan, config: DisparityConfig | None = None, known_relation: PairRelation | None = None
+    scan: Scan,
+    config: DisparityConfig | None = None,
+    known_relation: PairRelation | None = None,
+    n: Float[Tensor, "3"] | None = None,
 ) -> DepthSource:
     """The scan's own depth map where its camera computed one, else the one matched from its two images.
 
     Args:
         known_relation: of the two images, where it has been measured before.
+        n: motion of the object, by which the cameras of a raw rig see it moved between their planes; nominal if None.
     """
+    config = config or DisparityConfig()
     match scan.images:
         case DepthView(_, depth):
             return StoredDepth(depth)
         case StereoPair() as pair:
-            return MatchedDepth(pair, scan.rig, config or DisparityConfig(), known_relation=known_relation)
+            rectified = RectifiedPair.of(scan, config, n)
+            if rectified is not None:  # the relation does not depend on n
+                known_relation = known_relation or relation_of_scan(scan, config)
+            return MatchedDepth(pair, scan.rig, config, known_relation=known_relation, rectified=rectified)

@@ -7,7 +7,6 @@ import torch
 from torch import Tensor
 
 from lsvision.geometry import disparity_at_height
-from lsvision.image.brightness import gray, gray_bytes
 from lsvision.image.missing import missing_mask, missing_near
 from lsvision.image.stereo.agreement import occluded
 from lsvision.image.stereo.blocks import block_side, enlarged, repeated
@@ -20,7 +19,8 @@ from lsvision.image.stereo.sgbm import GrayPair, Search, match_sgbm
 from lsvision.image.stereo.steps import other_side_variance
 from lsvision.image.tiling import HaloRange
 from lsvision.stages.disparity.config import COARSE_TO_FINE_PX, DisparityConfig
-from lsvision.types import LineImage, Rig, StereoPair, TensorImage
+from lsvision.stages.disparity.gray_lines import GrayLines
+from lsvision.types import Rig, StereoPair, TensorImage
 
 # Times the pixels of a speckle: where the refinement has dropped most of a wrong patch, under glare, the rest is wrong.
 _LEFT_OVER = 4
@@ -74,17 +74,28 @@ def measure_block(
 ) -> StripMatch:
     """Disparity and sigma of the lines of one block, of images of any length.
 
-    Lines belong to the left image: where the cameras are out of step, the right one is read that many lines later.
-
     Args:
         relation: of the two images, ``relation_of`` the whole scan.
         index: of the block, which begins at line ``index * config.block_lines``.
     """
+    start = index * config.block_lines
+    return measure_lines(pair, relation, rig, config, range(start, start + config.block_lines))
+
+
+def measure_lines(
+    pair: StereoPair, relation: PairRelation, rig: Rig, config: DisparityConfig, wanted: range
+) -> StripMatch:
+    """Disparity and sigma of some lines, matched as one, of images of any length; those beyond the end are left out.
+
+    Lines belong to the left image: where the cameras are out of step, the right one is read that many lines later.
+    """
     config, shift, levels = config.for_width(pair.left.shape[1]), relation.rows.whole, relation.levels
-    lines = HaloRange.at(index * config.block_lines, config.block_lines, config.halo_lines or 0, pair.left.shape[0])
-    left, right = pair.left.read(lines.outer_start, lines.outer_stop), _read_shifted(pair.right, lines, shift)
-    unusable = UnusableSamples(levels.left.unusable(left), levels.right.unusable(right))
-    gray_left, gray_right = _gray(left, levels.white), relation.as_bright_as_left(_gray(right, levels.white))
+    lines = HaloRange.at(wanted.start, len(wanted), config.halo_lines or 0, pair.left.shape[0])
+    outer = range(lines.outer_start, lines.outer_stop)
+    left = GrayLines.read(pair.left, outer, levels.left, levels.white)
+    right = GrayLines.read(pair.right, range(outer.start + shift, outer.stop + shift), levels.right, levels.white)
+    unusable = UnusableSamples(left.unusable, right.unusable)
+    gray_left, gray_right = left.gray, relation.as_bright_as_left(right.gray)
     with_gain = relation.exposure is not None or config.matcher == "sgbm"
     missing = _missing(pair, lines, shift)  # blank in both images, they fit any disparity alike
     if bool(missing.any()):
@@ -100,17 +111,6 @@ def measure_block(
     return StripMatch(disparity, sigma)
 
 
-def _read_shifted(image: LineImage, lines: HaloRange, shift: int) -> Tensor:
-    """Lines of an image, ``shift`` later than asked for; beyond its ends those are repeated."""
-    last = image.shape[0] - 1
-    start, stop = (min(max(line, 0), last) for line in (lines.outer_start + shift, lines.outer_stop - 1 + shift))
-    values = image.read(start, stop + 1)
-    if not shift:
-        return values
-    wanted = torch.arange(lines.outer_start, lines.outer_stop) + shift
-    return values[wanted.clamp(start, stop) - start]
-
-
 def _missing(pair: StereoPair, lines: HaloRange, shift: int) -> Tensor:
     """Lines that one of the images lacks, of a range and its halo."""
     own = torch.arange(lines.outer_start, lines.outer_stop)
@@ -120,11 +120,6 @@ def _missing(pair: StereoPair, lines: HaloRange, shift: int) -> Tensor:
 def _mean_of(values: Tensor) -> int:
     """Mean grey value, whole; 0 of none."""
     return round(float(values.float().mean())) if values.numel() else 0
-
-
-def _gray(image: Tensor, white: float) -> Tensor:
-    """Brightness on a scale of 0..255, as is the configured noise: bytes of byte images, float32 of others."""
-    return gray_bytes(image) if image.dtype == torch.uint8 and white == 255.0 else gray(image) * (255.0 / white)
 
 
 def _measure(
