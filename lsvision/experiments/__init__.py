@@ -39,6 +39,7 @@ EXPERIMENTS = {
     "paper": Experiment("paper", "run_paper", "PaperSettings"),
     "simulate": Experiment("simulate", "run_simulate", "SimulateSettings"),
     "calibrate": Experiment("calibrate", "run_calibrate", "CalibrateSettings"),
+    "rig": Experiment("rig", "run_rig", "RigSettings"),
     "correct": Experiment("correct", "run_correct", "CorrectSettings"),
     "motion": Experiment("motion", "run_motion", "MotionSettings"),
     "reprocess": Experiment("reprocess", "run_reprocess", "ReprocessSettings"),

@@ -127,6 +127,11 @@ class RawPair:
         at = torch.full_like(self.baseline_mm, column)
         return self.baseline_mm / (self.left.slope(at) - self.right.slope(at))
 
+    @property
+    def middle(self) -> Float[Tensor, "*batch 3"]:
+        """The point (B/2, 0, z0), mm, midway between the cameras."""
+        return torch.stack([self.baseline_mm / 2, torch.zeros_like(self.z0_mm), self.z0_mm], dim=-1)
+
     def seen_left(self, points: Float[Tensor, "*#batch 3"], n: Float[Tensor, "*#batch 3"]) -> Seen:
         """Where the left camera sees points P, mm, of an object with the motion n."""
         travel = points[..., 1] / n[..., 1]

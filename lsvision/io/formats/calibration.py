@@ -151,7 +151,7 @@ def write_calibration(calibration: Calibration, path: Path | str) -> None:
         "converged": calibration.converged,
         "noise_scale": calibration.noise_scale,
         "errors_along_scan": [asdict(item) for item in calibration.errors_along_scan],
-        "motion": _motion_to_dict(calibration.motion),
+        "motion": motion_to_dict(calibration.motion),
         "rmse_before_mm": calibration.rmse_before_mm,
         "rmse_after_mm": calibration.rmse_after_mm,
         "improvement": calibration.improvement,
@@ -218,7 +218,8 @@ def check_rig_match(calibration: Calibration, scan: Scan) -> None:
             )
 
 
-def _motion_to_dict(motion: Motion) -> dict[str, object]:
+def motion_to_dict(motion: Motion) -> dict[str, object]:
+    """What a file says of a motion: n, what follows from it, and its covariance."""
     n1, n2, n3 = n = motion.n.double().tolist()
     return {
         "n": n,

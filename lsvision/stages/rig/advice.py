@@ -99,10 +99,10 @@ def _information(solution: RigSolution, poses: Float[Tensor, "poses 5"]) -> Floa
     """Information on what all boards share of one more scan of the first board in given poses."""
     model, count = solution.model, len(poses)
     turned, about_x, about_y, sideways, deeper = poses.unbind(-1)
-    zero, pair = torch.zeros_like(turned), RawPair.of(model.prior.rig)
+    zero = torch.zeros_like(turned)
     axes = (about_x, zero, zero), (zero, about_y, zero), (zero, zero, turned * math.pi / 2)
     about_x, about_y, in_plane = (rotation_from_vector(torch.stack(axis, dim=-1)) for axis in axes)
-    middle = torch.stack([pair.baseline_mm / 2 + sideways, zero, pair.z0_mm + deeper], dim=-1)
+    middle = RawPair.of(model.prior.rig).middle + torch.stack([sideways, zero, deeper], dim=-1)
     start = Pose((about_x @ about_y @ in_plane)[:, None], middle[:, None])
     simulated = RigModel(model.prior, start, zero[:, None], model.body_points[:1].expand(count, 1, -1, -1))
     first = solution.sightings.chosen([0])

@@ -7,7 +7,7 @@ scatter more than their covariance says, it is scaled as they ask.
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from lsvision.estimation import BorderedFit, BorderedState, bordered_least_squares
@@ -17,6 +17,7 @@ from lsvision.stages.rig.sightings import Sightings
 
 _NORMAL_MEDIAN = 3.3567  # median of a chi-square variable of four: a corner has a column and a travel in two images
 _ROUNDS = 10  # of leaving corners out
+_MOST = 0.7  # of a board's corners that must be left
 _SETTLED = 1.05  # ratio of two scales in a row
 
 
@@ -90,12 +91,19 @@ def _without_outliers(
         state = fit_rig(model, kept, state, scale, config).state
         before, scale = scale, _median_scale(model, kept, state)
         off = corner_residuals(model, sightings, state).square().sum(-1).sqrt()
-        valid = sightings.valid & (off <= config.outlier_sigma * scale[..., None, None])
+        valid = _near(sightings, off <= config.outlier_sigma * scale[..., None, None])
         settled = bool((valid == kept.valid).all() & (before <= _SETTLED * scale).all())
         kept = replace(kept, valid=valid)
         if settled:
             break
     return state, kept
+
+
+def _near(sightings: Sightings, near: Bool[Tensor, "*batch boards corners"]) -> Bool[Tensor, "*batch boards corners"]:
+    """The valid corners that are near; of a board most of whose corners are not, all: outliers are no whole board."""
+    valid = sightings.valid & near
+    few = valid.sum(-1) < _MOST * sightings.valid.sum(-1)
+    return torch.where(few[..., None], sightings.valid, valid)
 
 
 def _median_scale(model: RigModel, sightings: Sightings, state: BorderedState) -> Float[Tensor, "*batch"]:
