@@ -5,9 +5,12 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
+from torch import Tensor
+
 from lsvision import __version__
 from lsvision.errors import CalibrationError, ConfigError, UnusableCalibrationError
 from lsvision.experiments.settings import RunSettings, settings_sha256
+from lsvision.geometry import Rectification
 from lsvision.io import read_scan, scan_sha256, write_calibration, write_json
 from lsvision.report import calibration_report, calibration_summary
 from lsvision.report.progress import progress_bars
@@ -15,7 +18,7 @@ from lsvision.schema import Text
 from lsvision.stages.calibration.calibrate import calibrate
 from lsvision.stages.calibration.config import CalibrationConfig
 from lsvision.stages.corners.config import CornersConfig
-from lsvision.stages.corners.find import find_corners
+from lsvision.stages.corners.find import LocatedCorners, locate_in_images, measure_corners
 from lsvision.stages.corners.rows import row_difference
 from lsvision.types import Board, BoardCorners, Calibration, MissingLines, Provenance, Scan
 
@@ -45,8 +48,14 @@ def run_calibrate(settings: CalibrateSettings, folder: Path) -> None:
         UnusableCalibrationError: the calibration is inconsistent or did not converge; its files are written.
     """
     scans = read_scans(settings.scans, settings.missing_lines)
-    boards = find_boards(scans, settings.board, settings.corners)
+    located = locate_boards(scans, settings.board)
+    boards = measure_boards(scans, located, settings)
+    warn_of_lines(boards)
     calibration = calibrate(boards, scans[0].rig, settings.calibration)
+    if Rectification.of(scans[0].raw_rig) is not None:
+        # The cameras look at planes of their own: the n by which the object moves from one to the other is known now.
+        boards = measure_boards(scans, located, settings, calibration.motion.n)
+        calibration = calibrate(boards, scans[0].rig, settings.calibration)
     provenance = Provenance(
         version=__version__,
         config_sha256=settings_sha256(settings),
@@ -76,7 +85,7 @@ def read_scans(paths: Sequence[str], missing_lines: MissingLines = "refuse") -> 
         raise ConfigError("scans: the list is empty; give at least one scan folder, scans=[DIR,DIR,...]")
     scans = [read_scan(path, missing_lines=missing_lines) for path in paths]
     for scan in scans[1:]:
-        if scan.rig != scans[0].rig:
+        if (scan.rig, scan.raw_rig) != (scans[0].rig, scans[0].raw_rig):
             raise CalibrationError(f"{scan.path}: another rig than that of {scans[0].path}; calibrate each rig alone")
     for scan in scans:
         if scan.missing:
@@ -84,15 +93,30 @@ def read_scans(paths: Sequence[str], missing_lines: MissingLines = "refuse") -> 
     return scans
 
 
-def find_boards(scans: Sequence[Scan], board: Board, config: CornersConfig) -> list[BoardCorners]:
-    """Corners of the board in every scan."""
-    found = []
+def locate_boards(scans: Sequence[Scan], board: Board) -> list[LocatedCorners]:
+    """Corners of the board in the images of every scan."""
+    located = []
     with progress_bars() as bars:
         bar = bars.start("find corners", total=len(scans))
         for scan in scans:
-            found.append(find_corners(scan, board, config))
+            located.append(locate_in_images(scan, board))
             bars.advance(bar)
-    for corners in found:
+    return located
+
+
+def measure_boards(
+    scans: Sequence[Scan], located: Sequence[LocatedCorners], settings: CalibrateSettings, n: Tensor | None = None
+) -> list[BoardCorners]:
+    """What the located corners measure; see ``measure_corners``."""
+    return [
+        measure_corners(scan, settings.board, corners, settings.corners, n)
+        for scan, corners in zip(scans, located, strict=True)
+    ]
+
+
+def warn_of_lines(boards: Sequence[BoardCorners]) -> None:
+    """Warn of scans whose images show the corners on different lines."""
+    for corners in boards:
         difference = row_difference(corners)
         if difference is not None and difference.is_systematic:
             log.warning(
@@ -100,7 +124,6 @@ def find_boards(scans: Sequence[Scan], board: Board, config: CornersConfig) -> l
                 "of step or the rig is not rectified; lines are those of the left camera",
                 corners.scan, difference.lines, difference.sigma,
             )  # fmt: skip
-    return found
 
 
 def _summary(calibration: Calibration) -> dict:

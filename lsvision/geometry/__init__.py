@@ -42,6 +42,7 @@ from lsvision.geometry.product_axes import (
     to_product,
 )
 from lsvision.geometry.raw_pair import LineCamera, Met, RawPair, Seen, quantities_of, with_quantities
+from lsvision.geometry.rectification import Rectification, RowShear, ideal_rig, is_rectified
 from lsvision.geometry.rigid import (
     euler_angles,
     fit_rigid,
@@ -60,6 +61,8 @@ __all__ = [
     "Met",
     "ProductFrame",
     "RawPair",
+    "Rectification",
+    "RowShear",
     "Seen",
     "aligned_rotation",
     "camera_center_mm",
@@ -73,6 +76,8 @@ __all__ = [
     "fit_rigid",
     "focal_length_px",
     "from_product",
+    "ideal_rig",
+    "is_rectified",
     "left_jacobian",
     "line_at",
     "line_axes",

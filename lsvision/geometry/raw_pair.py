@@ -150,13 +150,18 @@ class RawPair:
     def meet(
         self, left_px: Float[Tensor, "*#batch"], right_px: Float[Tensor, "*#batch"], n: Float[Tensor, "*#batch 3"]
     ) -> Met:
-        """Where on an object of motion n the rays of a left and a right column meet.
+        """Where on an object of motion n the rays of a left and a right column meet."""
+        return self.meet_rays(self.left.slope(left_px), self.right.slope(right_px), n)
+
+    def meet_rays(
+        self, of_left: Float[Tensor, "*#batch"], of_right: Float[Tensor, "*#batch"], n: Float[Tensor, "*#batch 3"]
+    ) -> Met:
+        """Where on an object of motion n rays of the left and the right camera meet, by their slopes dx/dz.
 
         With Δ the travel between them, (z s_L, 0, z) = (B + z' s_R, s0 + .., z') + Δ n; all three are linear in z', the
         right camera's depth, and Δ.
         """
         s0, s1, s2 = self.plane.unbind(-1)
-        of_left, of_right = self.left.slope(left_px), self.right.slope(right_px)
         drift_x, drift_z = n[..., 0] / n[..., 1], n[..., 2] / n[..., 1]
         # Of the right camera's plane along its ray: Y = constant + by_depth z'.
         constant, by_depth = s0 + s1 * self.baseline_mm / 2 - s2 * self.z0_mm, s1 * of_right + s2

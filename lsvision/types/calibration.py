@@ -30,7 +30,8 @@ class BoardCorners:
     """The corners of one board in one scan, measured and true.
 
     ``points`` are the measured ``(x, travel, z)`` of every corner in the order of ``board_points``; ``covariance`` is
-    theirs, mm². A corner with ``valid`` false was not seen; its point is NaN.
+    theirs, mm². A corner with ``valid`` false was not seen; its point is NaN. ``left_px`` and ``right_px`` are where
+    both images show them, (column, line); of a raw rig, the images of its ideal pair.
     """
 
     scan: str

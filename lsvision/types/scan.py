@@ -11,6 +11,7 @@ from torch import Tensor
 
 from lsvision.schema import Checked, IntFrom2, Positive, PositiveInt
 from lsvision.types.line_motion import LineMotion
+from lsvision.types.raw_rig import RawRig
 
 Transport = Literal["forward", "reverse"]
 # What is done about lines of an image that are not there: the scan is refused, or goes on without them.
@@ -142,7 +143,11 @@ class DepthView:
 
 @dataclass(frozen=True)
 class Scan:
-    """One pass of an object under the rig; ``line_motion`` is what was logged of its motion from line to line."""
+    """One pass of an object under the rig; ``line_motion`` is what was logged of its motion from line to line.
+
+    ``raw_rig`` are the cameras of images that are not rectified, and ``rig`` the ideal pair that follows from them;
+    None where the images are those of ``rig`` itself.
+    """
 
     path: Path
     rig: Rig
@@ -151,6 +156,7 @@ class Scan:
     color_registered: bool = True
     attributes: Mapping[str, str] = field(default_factory=dict)
     line_motion: LineMotion | None = None
+    raw_rig: RawRig | None = None
 
     @property
     def left(self) -> LineImage:

@@ -1,5 +1,6 @@
-"""The four tilts that a separate program rendered: their scans, corners and truth, found once for all tests."""
+"""Boards that separate programs rendered: their scans, corners and truth, found once for all tests."""
 
+import dataclasses
 import json
 from functools import cache
 from pathlib import Path
@@ -7,11 +8,13 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from lsvision.geometry import scan_position, transform
+from lsvision.geometry import RawPair, ideal_rig, scan_position, transform
 from lsvision.io import read_scan
 from lsvision.stages.corners.find import find_corners
-from lsvision.types import BoardCorners, Scan
+from lsvision.types import BoardCorners, RawCamera, Scan, ViewPlane
 from tests.stages.rendered import BOARD
+
+_THEIR_Z0_MM = 796.9
 
 
 @cache
@@ -40,3 +43,26 @@ def true_points(scan: Scan) -> Tensor:
 
 def _truth(scan: Scan) -> dict:
     return json.loads((scan.path / "truth.json").read_text())
+
+
+@cache
+def raw_scans(shared_data: Path) -> tuple[Scan, ...]:
+    """Scans raw_a..raw_h of a raw rig, with the rig that they were rendered with in place of the data sheet's."""
+    return tuple(raw_scan(shared_data, f"raw_{name}") for name in "abcdefgh")
+
+
+def raw_scan(shared_data: Path, name: str) -> Scan:
+    """One of the scans of a raw rig, with the rig that it was rendered with."""
+    scan = read_scan(shared_data / "scans_shaken_and_raw" / name)
+    truth = _truth(scan)
+    pitch_mm = scan.raw_rig.pixel_pitch_um * 1e-3
+    left, right = (
+        RawCamera(side["f_px"] * pitch_mm, side["c"], side["turn"], (side["k1"], side["k2"]))
+        for side in (truth["left"], truth["right"])
+    )
+    view = ViewPlane(*(truth["right"][key] for key in ("s0", "s1", "s2")))
+    raw = dataclasses.replace(scan.raw_rig, left=left, right=right, view_plane=view)
+    # Their plane counts depth from another z0 than ours does.
+    moved = view.slope_z * (float(RawPair.of(raw).z0_mm) - _THEIR_Z0_MM)
+    raw = dataclasses.replace(raw, view_plane=dataclasses.replace(view, offset_mm=view.offset_mm + moved))
+    return dataclasses.replace(scan, raw_rig=raw, rig=ideal_rig(raw))

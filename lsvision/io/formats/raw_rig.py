@@ -1,6 +1,7 @@
 """The file of a raw pair of cameras: ``rig.yaml`` of the format lsvision-rig/2."""
 
 import math
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Literal
@@ -8,11 +9,12 @@ from typing import Literal
 import yaml
 
 from lsvision.errors import FileFormatError
+from lsvision.geometry import ideal_rig
 from lsvision.io.atomic import write_text
-from lsvision.io.formats.rig import ColorSpacing
+from lsvision.io.formats.rig import RIG_FORMAT, ColorSpacing, rig_from_dict
 from lsvision.io.formats.validation import read_entries, read_yaml
-from lsvision.schema import AcuteAngle, Checked, NonNegative, Positive, PositiveInt
-from lsvision.types import RIG_QUANTITIES, RawCamera, RawRig, ViewPlane
+from lsvision.schema import AcuteAngle, Checked, NonNegative, Positive, PositiveInt, shown
+from lsvision.types import RIG_QUANTITIES, RawCamera, RawRig, Rig, ViewPlane
 
 RawRigFormat = Literal["lsvision-rig/2"]
 RAW_RIG_FORMAT: RawRigFormat = "lsvision-rig/2"
@@ -66,6 +68,40 @@ class RawRigEntries(Checked):
             color_spacing_lines=(spacing.red, spacing.green, spacing.blue),
             sigma=tuple(sorted((self.sigma or {}).items())),
         )
+
+
+@dataclass(frozen=True)
+class RigPair:
+    """The pair of a rig file; where that holds a raw one, ``rig`` is the ideal pair that follows from it."""
+
+    rig: Rig
+    raw: RawRig | None
+
+    @property
+    def image_width_px(self) -> int:
+        """Columns of the images."""
+        return (self.raw or self.rig).width_px
+
+
+def read_rig_pair(path: Path | str) -> RigPair:
+    """Read ``rig.yaml`` of either format.
+
+    Raises:
+        FileFormatError: the file is missing, of neither format, or an entry is missing, unknown or out of range.
+    """
+    path = Path(path)
+    data = read_yaml(path)
+    format_ = data.get("format") if isinstance(data, Mapping) else None
+    if format_ == RAW_RIG_FORMAT:
+        raw = raw_rig_from_dict(data, path)
+        try:
+            return RigPair(ideal_rig(raw), raw)
+        except ValueError as error:
+            raise FileFormatError(path, str(error)) from None
+    if format_ is not None and format_ != RIG_FORMAT:
+        problem = f"expected {RIG_FORMAT} or {RAW_RIG_FORMAT}, got {shown(format_)}"
+        raise FileFormatError(path, problem, "format")
+    return RigPair(rig_from_dict(data, path), None)
 
 
 def read_raw_rig(path: Path | str) -> RawRig:

@@ -14,14 +14,26 @@ from lsvision.geometry import zero_disparity_mm
 from lsvision.io.atomic import partial_folder, write_text
 from lsvision.io.formats.encoder import read_encoder_log, write_encoder
 from lsvision.io.formats.line_motion import read_line_motion, write_line_motion
-from lsvision.io.formats.rig import read_rig, write_rig
+from lsvision.io.formats.raw_rig import read_rig_pair, write_raw_rig
+from lsvision.io.formats.rig import write_rig
 from lsvision.io.formats.validation import named_file, read_entries, read_yaml
 from lsvision.io.images.depth_map import PlausibleDepth
 from lsvision.io.images.line_image import open_line_image
 from lsvision.io.images.tiff import write_line_image
 from lsvision.io.json_file import write_json
 from lsvision.schema import Checked, Positive, Says, Text
-from lsvision.types import DepthView, LineImage, LineMotion, MissingLines, Rig, Scan, StereoPair, Transport, Travel
+from lsvision.types import (
+    DepthView,
+    LineImage,
+    LineMotion,
+    MissingLines,
+    RawRig,
+    Rig,
+    Scan,
+    StereoPair,
+    Transport,
+    Travel,
+)
 
 ScanFormat = Literal["lsvision-scan/1"]
 SCAN_FORMAT: ScanFormat = "lsvision-scan/1"
@@ -54,7 +66,8 @@ class NewScan:
 
     ``left``, ``right`` and ``depth`` are strips ``(lines, width, channels)`` of any height, each image taken to its end
     before the next; exactly one of right and depth is given. Depth is float32 z, mm, one channel, NaN where there is
-    none. ``extra_json`` is plain data by file name, written beside the scan ("truth.json").
+    none. The images are as wide as the rig's, and those of ``raw_rig`` where there is one, which is written in place of
+    ``rig``. ``extra_json`` is plain data by file name, written beside the scan ("truth.json").
 
     Raises:
         ValueError: not exactly one of right and depth, or a log of another length.
@@ -71,6 +84,7 @@ class NewScan:
     attributes: Mapping[str, str] = field(default_factory=dict)
     color_registered: bool = True
     line_motion: LineMotion | None = None
+    raw_rig: RawRig | None = None
     extra_json: Mapping[str, dict] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -81,6 +95,11 @@ class NewScan:
             raise ValueError(f"travel.positions_mm: expected {self.lines} positions, got {len(positions_mm)}")
         if self.line_motion is not None and self.line_motion.lines != self.lines:
             raise ValueError(f"line_motion: expected {self.lines} lines, got {self.line_motion.lines}")
+
+    @property
+    def width_px(self) -> int:
+        """Columns of the images."""
+        return (self.raw_rig or self.rig).width_px
 
     def entries(self) -> ScanEntries:
         """What ``scan.yaml`` says; an entry at its default is None."""
@@ -116,9 +135,14 @@ def read_scan(path: Path | str, *, repair_encoder: bool = False, missing_lines: 
     files: dict[str, Path] = {
         key: named_file(file, key, str(name)) for key in FILE_KEYS if (name := getattr(entries, key)) is not None
     }
-    rig = read_rig(files["rig"])
+    cameras = read_rig_pair(files["rig"])
+    rig = cameras.rig
     images = {key: open_line_image(named, missing_lines) for key, named in files.items() if key in IMAGE_KEYS}
-    check_images(file, rig, images)
+    check_images(file, cameras.image_width_px, images)
+    if cameras.raw is not None and "depth" in images:
+        raise FileFormatError(
+            file, "expected the rectified rig that the depth was computed with, lsvision-rig/1", "rig"
+        )
     left = images["left"]
     if "depth" in images:
         images["depth"] = _plausible_depth(file, rig, images["depth"])
@@ -140,6 +164,7 @@ def read_scan(path: Path | str, *, repair_encoder: bool = False, missing_lines: 
         color_registered=entries.color_registered is not False,
         attributes={name: str(value) for name, value in (entries.attributes or {}).items()},
         line_motion=read_line_motion(shaken, left.shape[0], travel) if shaken else None,
+        raw_rig=cameras.raw,
     )
 
 
@@ -170,14 +195,17 @@ def write_scan(folder: Path | str, scan: NewScan) -> None:
         ValueError: strips that do not add up to the image.
         FileFormatError: ``folder`` holds something else.
     """
-    shape = (scan.lines, scan.rig.width_px, scan.channels)
+    shape = (scan.lines, scan.width_px, scan.channels)
     with partial_folder(folder, marker=SCAN_FILE) as partial:
-        write_rig(scan.rig, partial / "rig.yaml")
+        if scan.raw_rig is None:
+            write_rig(scan.rig, partial / "rig.yaml")
+        else:
+            write_raw_rig(scan.raw_rig, partial / "rig.yaml")
         write_line_image(partial / "left.tif", scan.left, shape, scan.dtype)
         if scan.right is not None:
             write_line_image(partial / "right.tif", scan.right, shape, scan.dtype)
         if scan.depth is not None:
-            write_line_image(partial / "depth.tif", scan.depth, (scan.lines, scan.rig.width_px, 1), torch.float32)
+            write_line_image(partial / "depth.tif", scan.depth, (scan.lines, scan.width_px, 1), torch.float32)
         if scan.travel.positions_mm is not None:
             write_encoder(scan.travel.positions_mm, partial / "encoder.csv")
         if scan.line_motion is not None:
@@ -201,8 +229,8 @@ def _plausible_depth(file: Path, rig: Rig, stored: LineImage) -> PlausibleDepth:
     return depth
 
 
-def check_images(file: Path, rig: Rig, images: Mapping[str, LineImage]) -> None:
-    """Check that the images of a scan, by key, fit each other and the rig.
+def check_images(file: Path, width_px: int, images: Mapping[str, LineImage]) -> None:
+    """Check that the images of a scan, by key, fit each other and the width of the rig's.
 
     Raises:
         FileFormatError: they do not; names ``file`` and the key.
@@ -211,8 +239,8 @@ def check_images(file: Path, rig: Rig, images: Mapping[str, LineImage]) -> None:
         raise FileFormatError(file, f"expected exactly one of right and depth, got {len(images) - 1}", "right")
     lines = images["left"].shape[0]
     for key, image in images.items():
-        if image.shape[1] != rig.width_px:
-            raise FileFormatError(file, f"expected {rig.width_px} columns as the rig has, got {image.shape[1]}", key)
+        if image.shape[1] != width_px:
+            raise FileFormatError(file, f"expected {width_px} columns as the rig has, got {image.shape[1]}", key)
         if image.shape[0] != lines:
             raise FileFormatError(file, f"expected {lines} lines as left has, got {image.shape[0]}", key)
         if key == "depth" and (image.dtype != torch.float32 or image.shape[2] != 1):

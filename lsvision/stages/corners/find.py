@@ -3,10 +3,12 @@
 from dataclasses import dataclass
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from lsvision.errors import BoardNotFoundError
 from lsvision.geometry import (
+    Rectification,
     depth_map_jacobian,
     object_pitch_mm,
     slope_at,
@@ -18,6 +20,7 @@ from lsvision.image.board.detect import SeenBoard, locate_corners, look_for_boar
 from lsvision.image.board.refine import DetectedCorners
 from lsvision.image.planes import fit_local_planes
 from lsvision.stages.corners.config import CornersConfig
+from lsvision.stages.corners.ideal import IdealCorners
 from lsvision.stages.corners.pairing import pair_lattices
 from lsvision.stages.corners.rows import RowDifference
 from lsvision.types import Board, BoardCorners, DepthView, LineImage, Scan, StereoPair, Travel
@@ -25,12 +28,23 @@ from lsvision.types import Board, BoardCorners, DepthView, LineImage, Scan, Ster
 
 @dataclass(frozen=True)
 class _Measured:
-    """Corners as measured: (x, travel, z) mm, their covariance, mm², and which were seen."""
+    """Corners as measured: (x, travel, z) mm, their covariance, mm², and which were seen, where."""
 
     points: Tensor
     covariance: Tensor
     valid: Tensor
+    left_px: Tensor
     right_px: Tensor | None = None
+
+
+@dataclass(frozen=True)
+class LocatedCorners:
+    """Corners of a board in the images of a scan, in the order of ``Board.corner_points``; ``right`` is None where a
+    depth map replaces the right image.
+    """
+
+    left: DetectedCorners
+    right: DetectedCorners | None
 
 
 def find_corners(scan: Scan, board: Board, config: CornersConfig | None = None) -> BoardCorners:
@@ -42,14 +56,45 @@ def find_corners(scan: Scan, board: Board, config: CornersConfig | None = None) 
     Raises:
         BoardNotFoundError: no board, or fewer than ``min_corners`` corners, in one of the images; names the scan.
     """
-    config = config or CornersConfig()
+    return measure_corners(scan, board, locate_in_images(scan, board), config)
+
+
+def locate_in_images(scan: Scan, board: Board) -> LocatedCorners:
+    """Find the corners of a board in the images of a scan.
+
+    Raises:
+        BoardNotFoundError: no board in one of the images, or none that both show; names the scan.
+    """
     match scan.images:
         case StereoPair(_, right_image):
-            left, right = _detect_in_both(scan, right_image, board)
-            measured = _triangulated(scan, left, right, config)
-        case DepthView(_, depth):
+            return LocatedCorners(*_detect_in_both(scan, right_image, board))
+        case DepthView():
             [left] = _located(scan, [scan.left], [_look(scan, scan.left, "left", board)], board)
-            measured = _from_depth_map(scan, left, depth, config)
+            return LocatedCorners(left, None)
+
+
+def measure_corners(
+    scan: Scan,
+    board: Board,
+    located: LocatedCorners,
+    config: CornersConfig | None = None,
+    n: Float[Tensor, "3"] | None = None,
+) -> BoardCorners:
+    """Measure the corners that were located in the images of a scan.
+
+    Args:
+        n: motion of the object, by which the cameras of a raw rig see it moved between their planes; nominal if None.
+
+    Raises:
+        BoardNotFoundError: fewer than ``min_corners`` were measured; names the scan.
+    """
+    config = config or CornersConfig()
+    if located.right is not None:
+        measured = _triangulated(scan, located.left, located.right, config, Rectification.of(scan.raw_rig, n))
+    elif isinstance(scan.images, DepthView):
+        measured = _from_depth_map(scan, located.left, scan.images.depth, config)
+    else:
+        raise ValueError("located.right: expected the corners of the right image of a scan with two images")
     valid = measured.valid
     if int(valid.sum()) < config.min_corners:
         raise BoardNotFoundError(
@@ -62,7 +107,7 @@ def find_corners(scan: Scan, board: Board, config: CornersConfig | None = None) 
         covariance=torch.where(valid[:, None, None], measured.covariance, torch.nan),
         valid=valid,
         board_points=board.corner_points(),
-        left_px=left.position,
+        left_px=measured.left_px,
         right_px=measured.right_px,
     )
 
@@ -90,15 +135,22 @@ def _located(scan: Scan, images: list[LineImage], seen: list[SeenBoard], board: 
     return located
 
 
-def _triangulated(scan: Scan, left: DetectedCorners, right: DetectedCorners, config: CornersConfig) -> _Measured:
+def _triangulated(
+    scan: Scan,
+    left: DetectedCorners,
+    right: DetectedCorners,
+    config: CornersConfig,
+    rectification: Rectification | None = None,
+) -> _Measured:
     """From the columns of both images and the mean of both lines, weighted by their variance.
 
     Where the cameras are out of step, the lines are those of the left one.
     """
     valid = left.valid & right.valid
-    right_line = right.position[:, 1] - _lines_out_of_step(left, right, valid)
+    ideal = IdealCorners.of(left.position, right.position, rectification, scan.travel)
+    right_line = ideal.right[:, 1] - _lines_out_of_step(ideal, valid)
     valid &= (left.position[:, 1] - right_line).abs() <= config.max_line_difference
-    u_left, u_right = left.position[:, 0], right.position[:, 0]
+    u_left, u_right = ideal.left[:, 0], ideal.right[:, 0]
     x, z = triangulate(scan.rig, u_left, u_left - u_right)
     weight = left.covariance[:, 1, 1].reciprocal()
     weight = weight / (weight + right.covariance[:, 1, 1].reciprocal())
@@ -107,17 +159,17 @@ def _triangulated(scan: Scan, left: DetectedCorners, right: DetectedCorners, con
 
     pitch = _pitch_at(scan.travel, line)
     by_columns = triangulation_jacobian(scan.rig, u_left, u_left - u_right)
-    by_left = _point_jacobian(by_columns.sum(-1), pitch * weight)
-    by_right = _point_jacobian(-by_columns[..., 1], pitch * (1 - weight))
+    by_left = _point_jacobian(by_columns.sum(-1) * ideal.left_growth[:, None], pitch * weight)
+    by_right = _point_jacobian(-by_columns[..., 1] * ideal.right_growth[:, None], pitch * (1 - weight))
     covariance = by_left @ left.covariance @ by_left.mT + by_right @ right.covariance @ by_right.mT
     mixed = by_left @ left.covariance_with(right) @ by_right.mT
     covariance = covariance + mixed + mixed.mT
-    return _Measured(points, covariance, valid & torch.isfinite(points).all(-1), right.position)
+    return _Measured(points, covariance, valid & torch.isfinite(points).all(-1), ideal.left, ideal.right)
 
 
-def _lines_out_of_step(left: DetectedCorners, right: DetectedCorners, seen: Tensor) -> float:
+def _lines_out_of_step(ideal: IdealCorners, seen: Tensor) -> float:
     """By how many lines most of the corners are later in the right image; 0 where that is no more than noise."""
-    difference = RowDifference.of((right.position - left.position)[seen, 1])
+    difference = RowDifference.of((ideal.right - ideal.left)[seen, 1])
     return difference.lines if difference.is_systematic else 0.0
 
 
@@ -141,7 +193,7 @@ def _from_depth_map(scan: Scan, left: DetectedCorners, depth: LineImage, config:
     curvature = planes.slope[:, 0].square() / z * (half_columns**2 / 3)
     variance = planes.variance + curvature.square()
     covariance = by_pixel @ left.covariance @ by_pixel.mT + by_depth @ by_depth.mT * variance[:, None, None]
-    return _Measured(points, covariance, left.valid & planes.valid)
+    return _Measured(points, covariance, left.valid & planes.valid, left.position)
 
 
 def _point_jacobian(x_z_by_column: Tensor, y_by_line: Tensor) -> Tensor:

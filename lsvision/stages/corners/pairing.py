@@ -12,10 +12,11 @@ import torch
 from torch import Tensor
 
 from lsvision.errors import BoardNotFoundError
-from lsvision.geometry import travel_at, triangulate
+from lsvision.geometry import Rectification, travel_at, triangulate
 from lsvision.image.board.detect import SeenBoard
 from lsvision.image.board.lattice import SeenLattice
 from lsvision.image.board.placement import place_board
+from lsvision.stages.corners.ideal import ideal_lattice, lines_apart
 from lsvision.types import Board, Scan
 
 _FEWEST_SHARED = 12  # corners that both images show
@@ -41,9 +42,12 @@ def pair_lattices(scan: Scan, board: Board, left: SeenBoard, right: SeenBoard) -
     Raises:
         BoardNotFoundError: the images do not agree, or agree in several ways; names the scan.
     """
-    seen, turned = left.in_image(), _along_the_same_axes(left, right)
+    rectification = Rectification.of(scan.raw_rig)
+    seen = ideal_lattice(left.in_image(), rectification)
+    turned = ideal_lattice(_along_the_same_axes(left, right), rectification, right=True)
+    lines = lines_apart(seen.position, turned.position, rectification, scan.travel)
     apart = max(_LINES_APART, _COPY_PX * left.factor)
-    shifted = [turned.turned(_UNTURNED, shift) for shift in _shifts_on_the_same_lines(seen, turned, apart)]
+    shifted = [turned.turned(_UNTURNED, shift) for shift in _shifts_on_the_same_lines(seen, turned, lines, apart)]
     fitting = [lattice for lattice in shifted if _fits_on_board(left, right, lattice, board)]
     candidates = [_Candidate(lattice, _scale_misfit(scan, board, seen, lattice)) for lattice in fitting]
     candidates = [candidate for candidate in candidates if math.isfinite(candidate.misfit)]  # not behind the cameras
@@ -80,12 +84,11 @@ def _turns() -> Tensor:
     return torch.cat([straight, straight.flip(-1)])
 
 
-def _shifts_on_the_same_lines(left: SeenLattice, right: SeenLattice, apart: float) -> Tensor:
+def _shifts_on_the_same_lines(left: SeenLattice, right: SeenLattice, lines: Tensor, apart: float) -> Tensor:
     """Shifts (shifts, 2) of the right nodes by which enough corners coincide, on lines that are hardly apart."""
     shift = (left.node[:, None] - right.node[None]).flatten(0, 1)
-    lines = (left.position[:, None, 1] - right.position[None, :, 1]).abs().flatten()
     shifts, of_pair, shared = shift.unique(dim=0, return_inverse=True, return_counts=True)
-    mean = torch.zeros(len(shifts), dtype=lines.dtype).index_add_(0, of_pair, lines) / shared
+    mean = torch.zeros(len(shifts), dtype=lines.dtype).index_add_(0, of_pair, lines.flatten()) / shared
     same_colours = shifts.sum(-1) % 2 == 0
     return shifts[(shared >= _FEWEST_SHARED) & (mean <= apart) & same_colours]
 

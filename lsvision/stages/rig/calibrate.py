@@ -6,7 +6,7 @@ from dataclasses import replace
 import torch
 
 from lsvision.errors import CalibrationError
-from lsvision.geometry import RawPair, rotation_from_vector, with_quantities
+from lsvision.geometry import RawPair, ideal_rig, rotation_from_vector, sharp_depth_mm, with_quantities
 from lsvision.stages.rig.advice import next_scan
 from lsvision.stages.rig.config import RigConfig
 from lsvision.stages.rig.height_shape import HeightShape
@@ -44,9 +44,10 @@ def calibrate_rig(sightings: Sightings, scans: Sequence[str], rig: RawRig, confi
     shared = solution.shared
     if not bool(shared.vector.isfinite().all() & solution.found.factor.isfinite().all()):
         raise CalibrationError(f"{', '.join(scans)}: the corners do not determine the boards' poses")
-    shape = HeightShape.of(rig, shared, prior.sigma, config.depth_range_mm)
+    depth_range_mm = config.depth_range_mm or sharp_depth_mm(ideal_rig(rig))
+    shape = HeightShape.of(rig, shared, prior.sigma, depth_range_mm)
     weak = unobserved(solution.whitened_covariance, shape, config.observed_share)
-    advice = next_scan(solution, shape, config.depth_range_mm).in_words
+    advice = next_scan(solution, shape, depth_range_mm).in_words
     enough = config.held_out and solution.sightings.boards >= FEWEST_BOARDS
     held_out = HeldOut.of(solution, config) if enough else None
     reasons = [*_faults(solution), *_contradicting(solution, scans, held_out)]

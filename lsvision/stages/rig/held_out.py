@@ -28,7 +28,7 @@ class HeldOut:
         others = solution.sightings.chosen([[k for k in range(count) if k != i] for i in range(count)])
         start = BorderedState(shared.expand(count, -1), shared.new_zeros(count, count - 1, POSE))
         model = RigModel.of(others, prior)
-        by_others = fit_rig(model, others, start, solution.noise_scale.expand(count), config).state
+        by_others = fit_rig(model, others, start, shared.new_ones(others.valid.shape), config).state
         board = solution.sightings.chosen([[i] for i in range(count)])
         alone = RigModel.of(board, prior)
 

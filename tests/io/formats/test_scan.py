@@ -1,3 +1,4 @@
+import dataclasses
 import math
 from collections.abc import Callable
 from pathlib import Path
@@ -10,9 +11,10 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from lsvision.errors import FileFormatError
-from lsvision.geometry import zero_disparity_mm
+from lsvision.geometry import ideal_rig, zero_disparity_mm
 from lsvision.io import read_scan, write_line_image, write_rig
-from lsvision.types import DepthView, Rig, Travel
+from lsvision.io.formats.raw_rig import write_raw_rig
+from lsvision.types import DepthView, RawCamera, RawRig, Rig, Travel, ViewPlane
 
 MakeScan = Callable[..., Path]
 
@@ -221,3 +223,32 @@ def test_scan_of_another_renderer(shared_data: Path) -> None:
     for name, image in (("left", scan.left), ("right", scan.images.right)):
         expected = tifffile.imread(folder / f"{name}.tif")
         assert torch.equal(image.read(100, 333), torch.from_numpy(expected[100:333]))
+
+
+RAW = RawRig(
+    32, 80.0, 354.0, RawCamera(113.84, 15.0, 0.2212, (0.01, 0.0)), RawCamera(113.84, 16.0, -0.2203),
+    ViewPlane(0.25, 0.003, 0.002), sigma=(("baseline_mm", 0.1),),
+)  # fmt: skip
+
+
+def test_a_scan_of_a_raw_rig(make_scan: MakeScan, small_rig: Rig, tmp_path: Path) -> None:
+    folder = make_scan(rig=ideal_rig(RAW), raw_rig=RAW)
+    scan = read_scan(folder)
+    assert scan.raw_rig is not None
+    assert scan.raw_rig.view_plane == RAW.view_plane
+    assert scan.raw_rig.left.turn_rad == pytest.approx(0.2212, rel=1e-14)  # degrees in the file
+    assert scan.rig == ideal_rig(RAW)
+    assert scan.rig.width_px > scan.left.shape[1] == 32
+    write_raw_rig(dataclasses.replace(RAW, width_px=33), folder / "rig.yaml")
+    with pytest.raises(FileFormatError, match="left: expected 33 columns as the rig has, got 32"):
+        read_scan(folder)
+    write_raw_rig(dataclasses.replace(RAW, left=RawCamera(113.84, 15.0, -0.3)), folder / "rig.yaml")
+    with pytest.raises(FileFormatError, match=r"rig.yaml: the middles of both sensors look at no common point"):
+        read_scan(folder)
+    (folder / "rig.yaml").write_text("format: lsvision-rig/3")
+    with pytest.raises(FileFormatError, match="format: expected lsvision-rig/1 or lsvision-rig/2, got 'lsvision-rig/3"):
+        read_scan(folder)
+    mapped = make_scan(right=None, depth=[depth_map(small_rig)])
+    write_raw_rig(RAW, mapped / "rig.yaml")
+    with pytest.raises(FileFormatError, match="rig: expected the rectified rig that the depth was computed with"):
+        read_scan(mapped)

@@ -43,16 +43,23 @@ class Truth:
 def scanned(
     truth: Truth, boards: int, noise: float = NOISE_PX, stated: float = NOISE_PX, n_by_board: Tensor | None = None
 ) -> Sightings:
-    """Boards flat to within 4 deg and 20 mm, at either side of the field, lying across and along in turn."""
-    runs = len(truth.n)
-    yaw = (math.pi / 2 * (torch.arange(boards) % 2)).double() + 0.1 * draw(runs, boards)
-    zero = torch.zeros_like(yaw)
-    about = torch.stack(
-        [math.radians(4) * draw(runs, boards).sign(), math.radians(4) * draw(runs, boards).sign(), zero], -1
+    """Boards of a balanced design: across and along, tilted by 4 deg either way, either side of the field, 20 mm apart.
+
+    Args:
+        noise: of the columns, px; ``stated`` is what their covariance says.
+    """
+    runs, index = len(truth.n), torch.arange(boards)
+    a, b, c = (((index >> bit) & 1).double() for bit in range(3))
+    along, about_x, about_y, sideways, deeper = (
+        (2 * ((sum(bits)) % 2) - 1) for bits in ([a], [b], [c], [b, c], [a, b, c])
     )
-    rotation = rotation_from_vector(about) @ rotation_from_vector(torch.stack([zero, zero, yaw], dim=-1))
-    sideways = torch.where(yaw.cos().abs() > 0.5, 80.0, 130.0) * draw(runs, boards).sign()
-    middle = torch.stack([177 + sideways, zero + 200, 796.9 + 20 * draw(runs, boards).sign()], dim=-1)
+    few = 1 + 0.05 * draw(5, runs, boards)
+    zero = torch.zeros(runs, boards, dtype=torch.float64)
+    tilt = torch.stack([math.radians(4) * about_x * few[0], math.radians(4) * about_y * few[1], zero], dim=-1)
+    yaw = torch.stack([zero, zero, math.pi / 4 * (1 + along) + 0.1 * few[2]], dim=-1)
+    rotation = rotation_from_vector(tilt) @ rotation_from_vector(yaw)
+    places = [177 + torch.where(along > 0, 130.0, 80.0) * sideways * few[3], zero + 200, 796.9 + 20 * deeper * few[4]]
+    middle = torch.stack(places, dim=-1)
     body = BOARD.corner_points()
     points = transform(rotation, middle, (body - body.mean(0)).expand(runs, boards, -1, 3))
     pair = RawPair.of(DATA_SHEET, truth.quantities[:, None, None])
