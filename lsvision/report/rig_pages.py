@@ -8,10 +8,6 @@ from lsvision.report.pages import Headline, Page, ReportFigure, Table, write_rep
 from lsvision.report.summary import drift_in_words
 from lsvision.types import RIG_QUANTITIES, RawRig, RigCalibration
 
-_UNITS = {
-    "focal_length_mm": "mm", "baseline_mm": "mm", "offset_mm": "mm", "principal_point_px": "px", "turn_deg": "deg"
-}  # fmt: skip
-
 
 def rig_summary(calibration: RigCalibration) -> str:
     """A calibrated rig in plain words, for the terminal."""
@@ -69,10 +65,12 @@ def _quantities(calibration: RigCalibration, start: RawRig) -> Table:
         dict(calibration.rig.sigma),
     )
     rows = [
-        (name, _UNITS.get(name.split(".")[-1], "1"), f"{old:.6g}", f"{new:.6g}", f"{sigma[name]:.2g}")
+        (name, f"{new:.6g}", f"{sigma[name]:.2g}", f"{old:.6g}")
         for name, old, new in zip(RIG_QUANTITIES, before, after, strict=True)
     ]
-    return Table("Rig", ("quantity", "unit", "data sheet", "found", "sigma"), rows, "As in rig.yaml.")
+    return Table(
+        "Rig", ("quantity", "found", "sigma", "data sheet"), rows, "As in rig.yaml; lengths in mm, columns in px."
+    )
 
 
 def _boards(calibration: RigCalibration) -> Table:
@@ -110,9 +108,9 @@ def _by(what: str, calibration: RigCalibration) -> ReportFigure:
             )
             panel.axhline(0.0, color="#555555", linewidth=0.6)
             label = "column [px]" if what == "column" else "depth z [mm]"
-            label_axes(panel, f"{name} image", label, f"{quantity}, measured less predicted [{unit}]")
+            label_axes(panel, f"{name} image", label, f"{quantity} off by [{unit}]")
     caption = (
-        f"What the rig leaves of the corners, by {what}. A curve that all boards share is something that the model of "
+        f"Corners measured less predicted, by {what}. A curve that all boards share is something that the model of "
         "the cameras lacks; a curve of one board is a board that is not flat, or an object that shook."
     )
     return ReportFigure(f"residuals_by_{what}", f"Residuals by {what}", caption, figure)
