@@ -46,5 +46,6 @@ EXPERIMENTS = {
     "status": Experiment("reprocess", "run_status", "StatusSettings"),
     "validate": Experiment("validate", "run_validate", "ValidateSettings"),
     "study": Experiment("study", "run_study", "StudySettings"),
+    "study_rig": Experiment("study_rig", "run_study_rig", "StudyRigSettings"),
     "collect": Experiment("sweep", "run_collect", "CollectSettings"),
 }

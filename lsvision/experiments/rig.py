@@ -21,14 +21,14 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, kw_only=True)
 class RigSettings(RunSettings):
-    """Options of the experiment; ``rig`` is the file of the data sheet, that of the first scan if None.
+    """Options of the experiment; ``data_sheet`` is the file of the rig to start from, that of the first scan if None.
 
     A scan without some of its frames or Zarr chunks is refused; with ``missing_lines`` "mark" the corners on their
     lines are not measured.
     """
 
     scans: list[Text] = field(default_factory=list)
-    rig: Text | None = None
+    data_sheet: Text | None = None
     board: Board
     estimate: RigConfig
     missing_lines: MissingLines = "refuse"
@@ -42,7 +42,7 @@ def run_rig(settings: RigSettings, folder: Path) -> None:
             written.
     """
     scans = read_scans(settings.scans, settings.missing_lines)
-    start = _data_sheet(scans[0], settings.rig)
+    start = _data_sheet(scans[0], settings.data_sheet)
     sightings = find_sightings(scans, settings.board)
     calibration = calibrate_rig(sightings, [str(scan.path) for scan in scans], start, settings.estimate)
     provenance = Provenance(
@@ -76,5 +76,5 @@ def find_sightings(scans: list[Scan], board: Board) -> Sightings:
 def _data_sheet(scan: Scan, path: str | None) -> RawRig:
     rig = scan.raw_rig if path is None else read_raw_rig(path)
     if rig is None:
-        raise ConfigError(f"rig: {scan.path} has a rectified rig; give the data sheet of the raw one, rig=FILE")
+        raise ConfigError(f"data_sheet: {scan.path} has a rectified rig; name the file of the raw one, data_sheet=FILE")
     return rig

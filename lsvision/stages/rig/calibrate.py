@@ -63,7 +63,7 @@ def calibrate_rig(sightings: Sightings, scans: Sequence[str], rig: RawRig, confi
         boards=_boards(solution, scans, held_out),
         residuals=_residuals(solution),
         noise_scale=float(solution.noise_scale),
-        height_error_um=1e3 * shape.rms_mm(solution.found.factor),
+        height_error_um=1e3 * float(shape.stated_mm(solution.found.factor)),
         unobserved=weak,
         advice=advice,
         verdict=_verdict(solution, bool(bending)),

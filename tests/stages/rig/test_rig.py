@@ -9,16 +9,12 @@ import torch
 
 from lsvision.geometry import RawPair, quantities_of
 from lsvision.stages.rig.calibrate import calibrate_rig
-from lsvision.stages.rig.config import RigConfig
-from lsvision.stages.rig.height_shape import HeightShape, bend_mm
+from lsvision.stages.rig.height_shape import HeightShape
 from lsvision.stages.rig.model import QUANTITIES, RigPrior, Shared
 from lsvision.stages.rig.sightings import CameraSighting, joined, sighted
 from lsvision.stages.rig.solve import solve_rig
 from lsvision.types import Board, Travel
-from tests.stages.rig.boards import DATA_SHEET, Truth, first_of, scanned
-
-CONFIG = RigConfig()
-PRIOR = RigPrior.of(DATA_SHEET, CONFIG)
+from tests.stages.rig.boards import CONFIG, DATA_SHEET, PRIOR, Truth, first_of, restated
 
 
 def calibrated(sightings, **options):
@@ -28,11 +24,11 @@ def calibrated(sightings, **options):
 
 def test_exact_sightings_give_the_rig_and_the_motion():
     truth = Truth.drawn(2)
-    found = solve_rig(scanned(truth, 8, noise=0.0, stated=1e-3), PRIOR, CONFIG)
+    found = solve_rig(restated(truth.scanned(8, noise=1e-6), 1e-3 / 0.03), PRIOR, CONFIG)
     off = found.shared.vector - truth.vector
     assert bool(found.found.converged.all())
     assert float((off / found.covariance.diagonal(dim1=-2, dim2=-1).sqrt()).abs().max()) < 0.1  # the prior's pull
-    assert float(bend_mm(shape_at(truth), off / PRIOR.sigma).max()) < 1e-4
+    assert float(shape_at(truth).bend_mm(off / PRIOR.sigma).max()) < 1e-4
 
 
 def shape_at(truth: Truth) -> HeightShape:
@@ -40,26 +36,26 @@ def shape_at(truth: Truth) -> HeightShape:
 
 
 def test_sigmas_are_those_of_the_errors():
-    truth = Truth.drawn(60)
-    found = solve_rig(scanned(truth, 6), PRIOR, CONFIG)
+    truth = Truth.drawn(40)
+    found = solve_rig(truth.scanned(6), PRIOR, CONFIG)
     error = found.shared.vector - truth.vector
     nees = (error * torch.linalg.solve(found.covariance, error)).sum(-1)
-    assert 14.5 < float(nees.mean()) < 19.5  # 17 ± 3 sqrt(2 * 17 / 60)
+    assert 14.2 < float(nees.mean()) < 19.8  # 17 ± 3 sqrt(2 * 17 / 40)
     assert float(found.noise_scale.max()) < 1.15
 
 
 @pytest.mark.parametrize(("boards", "most_um"), [(8, 10.0), (16, 5.0)])
 def test_heights_are_known_as_well_as_was_asked_for(boards, most_um):
     truth = Truth.drawn(6)
-    found = solve_rig(scanned(truth, boards), PRIOR, CONFIG)
-    bends = 1e3 * bend_mm(shape_at(truth), (found.shared.vector - truth.vector) / PRIOR.sigma)
-    stated = 1e3 * shape_at(truth).rms_mm(found.found.factor[0])
+    found = solve_rig(truth.scanned(boards), PRIOR, CONFIG)
+    bends = 1e3 * shape_at(truth).bend_mm((found.shared.vector - truth.vector) / PRIOR.sigma)
+    stated = 1e3 * float(shape_at(truth).stated_mm(found.found.factor[0]))
     assert float(bends.square().mean().sqrt()) < most_um
     assert 0.4 * stated < float(bends.square().mean().sqrt()) < 1.6 * stated
 
 
 def test_two_boards_leave_combinations_to_the_data_sheet():
-    found = calibrated(first_of(scanned(Truth.drawn(1), 2)))
+    found = calibrated(first_of(Truth.drawn(1).scanned(2)))
     assert found.verdict == "prior-dominated"
     assert any("principal_point_px" in item.in_words for item in found.unobserved)
     assert found.advice in found.reasons
@@ -67,7 +63,7 @@ def test_two_boards_leave_combinations_to_the_data_sheet():
 
 
 def test_eight_boards_determine_the_rig():
-    found = calibrated(first_of(scanned(Truth.drawn(1), 8)))
+    found = calibrated(first_of(Truth.drawn(1).scanned(8)))
     assert (found.verdict, found.reasons) == ("determined", ())
     assert all(0.7 < board.rms < 1.3 and 0.7 < board.held_out_rms < 1.4 for board in found.boards)
     assert dict(found.rig.sigma)["baseline_mm"] < 0.1
@@ -75,7 +71,7 @@ def test_eight_boards_determine_the_rig():
 
 def test_corners_far_off_are_left_out():
     truth = Truth.drawn(1)
-    sightings = first_of(scanned(truth, 8))
+    sightings = first_of(truth.scanned(8))
     wrong = torch.rand(sightings.valid.shape) < 0.03
     moved = torch.where(wrong[..., None], 3.0, 0.0) * torch.tensor([1.0, 0.07])
     left = CameraSighting(sightings.left.position + moved, sightings.left.factor)
@@ -91,7 +87,7 @@ def test_scans_at_different_speeds_contradict_each_other():
     truth = Truth.drawn(1)
     n = truth.n[:, None].repeat(1, 8, 1)
     n[:, 0, 1] *= 1.03
-    found = calibrated(first_of(scanned(truth, 8, n_by_board=n)))
+    found = calibrated(first_of(truth.scanned(8, n=n)))
     assert found.verdict == "inconsistent"
     assert "its speed changed" in found.reasons[0]
     assert found.reasons[1].startswith("without s0 the others agree to 1.0 sigmas")
@@ -99,9 +95,9 @@ def test_scans_at_different_speeds_contradict_each_other():
 
 def test_more_noise_than_stated_makes_larger_sigmas():
     truth = Truth.drawn(1)
-    found = solve_rig(scanned(truth, 8, noise=0.06), PRIOR, CONFIG)
+    found = solve_rig(truth.scanned(8, noise=2.0), PRIOR, CONFIG)
     assert 1.8 < float(found.noise_scale[0]) < 2.2
-    usual = solve_rig(scanned(truth, 8), PRIOR, CONFIG)
+    usual = solve_rig(truth.scanned(8), PRIOR, CONFIG)
     ratio = (found.covariance.diagonal(dim1=-2, dim2=-1) / usual.covariance.diagonal(dim1=-2, dim2=-1)).sqrt()
     assert 1.5 < float(ratio.median()) < 2.3
 
@@ -127,11 +123,11 @@ def test_a_bend_is_what_the_heights_of_a_plate_do():
     height = pair.z0_mm - wrong.meet(columns, right, truth.n[0]).z
     tilt = torch.stack([torch.ones_like(z), plate[:, 0]], dim=-1)
     bend = height - tilt @ torch.linalg.lstsq(tilt, height[:, None]).solution[:, 0]
-    assert float(bend_mm(shape, error)) == pytest.approx(float(bend.square().mean().sqrt()), rel=0.15)
+    assert float(shape.bend_mm(error)) == pytest.approx(float(bend.square().mean().sqrt()), rel=0.15)
 
 
 def test_the_proposed_scan_helps_as_much_as_it_says():
-    found = calibrated(first_of(scanned(Truth.drawn(1), 3)), held_out=False)
+    found = calibrated(first_of(Truth.drawn(1).scanned(3)), held_out=False)
     promised = float(found.advice.split("known to ")[1].split(" um")[0])
     assert promised < 0.8 * found.height_error_um
     assert "lay the board with its longer side" in found.advice
@@ -161,4 +157,4 @@ def test_another_renderers_raw_boards(shared_data):
     assert found.verdict == "determined"
     assert found.noise_scale < 1.2
     shape = HeightShape.of(rig, Shared(true[:QUANTITIES], true[QUANTITIES:]), RigPrior.of(rig, CONFIG).sigma, 52.0)
-    assert 1e3 * float(bend_mm(shape, off / RigPrior.of(rig, CONFIG).sigma)) < 2 * found.height_error_um
+    assert 1e3 * float(shape.bend_mm(off / RigPrior.of(rig, CONFIG).sigma)) < 2 * found.height_error_um
