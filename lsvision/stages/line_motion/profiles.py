@@ -45,6 +45,11 @@ class LineSamples:
         """Those of some columns."""
         return LineSamples(self.z[:, columns], self.sigma[:, columns], self.slope[columns], self.columns[columns])
 
+    def split(self, lines: int) -> "list[LineSamples]":
+        """Those of some lines after the other."""
+        parts = zip(self.z.split(lines), self.sigma.split(lines), strict=True)
+        return [LineSamples(z, sigma, self.slope, self.columns) for z, sigma in parts]
+
 
 @dataclass(frozen=True)
 class Reference:
