@@ -38,6 +38,7 @@ _SPREADS = {"sigma": 2.5, "length": 1.5, "noise_scale": 0.7, "memory": 0.7}  # o
 _NOTHING = 1e-3  # of the errors of a line: a component that is not there
 _OBSERVED = 2.0  # errors of a line over what a component usually amounts to, at most
 _SPIKE_SIGMA, _SPIKE_LINES = 8.0, 9
+_LINES_AT_ONCE = 4096
 
 
 def not_measured(lines: int, reason: str) -> LineMotion:
@@ -100,7 +101,8 @@ def _noisy_values(lines: Registered, usual_samples: int, config: LineMotionConfi
     values = values - values.nanmedian(0).values.nan_to_num()
     half = _SPIKE_LINES // 2
     around = torch.cat([values[:1].expand(half, -1), values, values[-1:].expand(half, -1)]).unfold(0, _SPIKE_LINES, 1)
-    off = (values - around.nanmedian(-1).values).abs()
+    medians = [some.nanmedian(-1).values for some in around.split(_LINES_AT_ONCE)]
+    off = (values - torch.cat(medians)).abs()
     usual = (NORMAL_OVER_MAD * off.nanmedian(0).values).nan_to_num()  # due to the motion itself and correlated errors
     valid &= ~(off > _SPIKE_SIGMA * root.square().sum(-1).sqrt().maximum(usual)).any(1)
     return NoisyValues(torch.where(valid[:, None], values, 0.0), root, valid)

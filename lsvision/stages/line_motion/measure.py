@@ -25,7 +25,8 @@ _APART = 4  # lines of a window; neighbours err alike
 _READ_LINES, _AT_ONCE = 1024, 256  # read and registered at once
 _SUMMED_READS = 8  # whose residuals say how large the errors are
 _ROUNDS = 3  # of aligning lines and making the reference of them
-_CROWN_SHARE = 0.95  # of the heights of a line: about its crown
+_CROWN_SHARE = 0.95  # of the heights of a line: about its crown, or lower
+_BELOW_MM = 5.0  # of the profile's depth, from where on samples take no part
 
 
 def measure_line_motion(scan: Scan, depth: DepthSource, motion: Motion, config: LineMotionConfig) -> LineMotion:
@@ -61,9 +62,11 @@ def _shown(frame: ProductFrame, depth: DepthSource, config: LineMotionConfig) ->
     spread = _spread_lines(depth, config.reference_lines)
     samples = LineSamples.of(spread, frame, config.height_range_mm, slice(None))
     values = samples.z.new_zeros(len(samples.z), 3)
-    crown = placed(samples, values, frame)[1].nanquantile(_CROWN_SHARE, dim=1).nan_to_num()
+    height = placed(samples, values, frame)[1]
+    crown = height.nanquantile(_CROWN_SHARE, dim=1).nan_to_num()
     values[:, 1] = crown - crown.median()
-    shown = None
+    samples = samples.among(height >= crown[:, None] - config.profile_depth_mm - _BELOW_MM)
+    first, shown = int(samples.columns[0]), None
     for _ in range(_ROUNDS):
         q_x, height = placed(samples, values, frame)
         reference = reference_profile(q_x, height, object_pitch_mm(frame.rig), config.profile_depth_mm)
@@ -74,6 +77,7 @@ def _shown(frame: ProductFrame, depth: DepthSource, config: LineMotionConfig) ->
             return None
         found = register(samples.on(columns), values, reference, frame, config)
         values = found.values - found.values.median(0).values
+        columns = slice(first + columns.start, first + columns.stop, columns.step)
         shown = _Shown(reference, columns, int(found.samples.median()))
     return shown
 
@@ -83,18 +87,19 @@ def _registered(
 ) -> tuple[Registered, ErrorSums]:
     """The lines of a scan, a few at a time, and sums over what is left of them at places all over the scan."""
     starts = range(0, depth.lines, _READ_LINES)
-    summed = {i * (len(starts) - 1) // max(_SUMMED_READS - 1, 1) for i in range(_SUMMED_READS)}
-    parts, sums = [], []
+    summed = {i * (len(starts) - 1) // (_SUMMED_READS - 1) for i in range(_SUMMED_READS)}
+    lines, sums = Registered.nothing(depth.lines), []
     for number, start in enumerate(starts):
         block = depth.read(start, min(start + _READ_LINES, depth.lines))
         samples = LineSamples.of(block, frame, config.height_range_mm, shown.columns)
         for part in samples.split(_AT_ONCE):
             found = register(part, part.z.new_zeros(len(part.z), 3), shown.reference, frame, config)
-            parts.append(found)
+            lines.put(start, found)
+            start += len(part.z)
             if number in summed:
                 equations = equations_of(part, found.values, shown.reference, frame)
                 sums.append(ErrorSums.of(equations, config.cut_sigma))
-    return Registered.joined(parts), ErrorSums.total(sums)
+    return lines, ErrorSums.total(sums)
 
 
 def _spread_lines(depth: DepthSource, count: int) -> Depth:

@@ -51,6 +51,20 @@ class Registered:
         """Those of several ranges of lines, one after the other."""
         return cls(*(torch.cat([getattr(part, field.name) for part in parts]) for field in fields(cls)))
 
+    @classmethod
+    def nothing(cls, lines: int) -> "Registered":
+        """Lines of which nothing is known yet.
+
+        Small results of many blocks, kept as they come, would hold the memory of what was freed between them.
+        """
+        zeros = torch.zeros(lines, 3, dtype=torch.float64)
+        return cls(zeros, zeros[..., None].repeat(1, 1, 3), zeros[:, 0].long(), zeros.clone(), zeros.clone())
+
+    def put(self, start: int, part: "Registered") -> None:
+        """Write the lines from ``start`` on."""
+        for field in fields(self):
+            getattr(self, field.name)[start : start + len(part.values)] = getattr(part, field.name)
+
 
 def placed(
     samples: LineSamples, values: Float[Tensor, "lines 3"], frame: ProductFrame

@@ -58,6 +58,10 @@ def test_batch_equals_loop() -> None:
         torch.testing.assert_close(getattr(alone, part.name)[0], getattr(whole, part.name)[2], rtol=1e-9, atol=1e-12)
     twice = Registered.joined([alone, alone])
     assert torch.equal(twice.values[0], twice.values[1])
+    kept = Registered.nothing(4)
+    kept.put(2, alone)
+    assert torch.equal(kept.values[2], alone.values[0])
+    assert not kept.information[[0, 1, 3]].any()
 
 
 def test_information_is_that_of_independent_samples() -> None:
