@@ -8,7 +8,7 @@ from pathlib import Path
 from lsvision import __version__
 from lsvision.errors import CalibrationError, ConfigError, UnusableCalibrationError
 from lsvision.experiments.settings import RunSettings, settings_sha256
-from lsvision.io import read_scan, scan_sha256, write_calibration, write_json
+from lsvision.io import read_scan, scan_sha256, write_calibration, write_json, write_line_motion
 from lsvision.report import calibration_report, calibration_summary
 from lsvision.report.progress import progress_bars
 from lsvision.schema import Text
@@ -52,14 +52,29 @@ def run_calibrate(settings: CalibrateSettings, folder: Path) -> None:
         config_sha256=settings_sha256(settings),
         scans=tuple((str(scan.path), scan_sha256(scan.path)) for scan in scans),
     )
-    calibration = replace(calibration, provenance=provenance)
     target = Path(settings.output) if settings.output else folder / "calibration.json"
+    calibration = write_line_motions(replace(calibration, provenance=provenance), target)
     write_calibration(calibration, target)
     write_json(folder / "summary.json", _summary(calibration))
     calibration_report(calibration, boards, asdict(settings), folder)
     log.info("%s\nwrote %s and %s", calibration_summary(calibration), target, folder / "report.html")
     if not calibration.usable:
         raise UnusableCalibrationError(str(target), calibration.verdict, calibration.reasons)
+
+
+def write_line_motions(calibration: Calibration, target: Path) -> Calibration:
+    """Write the motion of every board's scan from line to line beside a calibration's file, which names them.
+
+    ``+experiment=correct line_motion=FILE`` takes each for its own scan.
+    """
+    if not calibration.line_motions:
+        return calibration
+    boards = []
+    for number, (board, motion) in enumerate(zip(calibration.boards, calibration.line_motions, strict=True), start=1):
+        name = f"{target.stem}_line_motion_{number}_{Path(board.scan).name}.parquet"
+        write_line_motion(motion, target.with_name(name))
+        boards.append(replace(board, line_motion_file=name))
+    return replace(calibration, boards=tuple(boards))
 
 
 def read_scans(paths: Sequence[str], missing_lines: MissingLines = "refuse") -> list[Scan]:
@@ -113,6 +128,11 @@ def _summary(calibration: Calibration) -> dict:
         "notes": list(calibration.notes),
         "noise_scale": calibration.noise_scale,
         "errors_along_scan": [asdict(error) for error in calibration.errors_along_scan],
+        "line_motion": {
+            board.line_motion_file: [finding.in_words for finding in board.line_motion]
+            for board in calibration.boards
+            if board.line_motion_file
+        },
         "n": calibration.motion.n.tolist(),
         "sigma": calibration.motion.sigma.tolist(),
         "stretch": calibration.motion.stretch,

@@ -19,6 +19,7 @@ from lsvision.types.calibration import (
     Provenance,
     RefusedVerdict,
     Verdict,
+    WhetherLineMotion,
 )
 from lsvision.types.line_motion import LINE_COMPONENTS, LineComponent, LineFinding, LineMotion
 from lsvision.types.product import (
@@ -75,5 +76,6 @@ __all__ = [
     "Transport",
     "Travel",
     "Verdict",
+    "WhetherLineMotion",
     "missing_ranges",
 ]

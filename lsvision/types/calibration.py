@@ -8,9 +8,12 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from lsvision.schema import NonNegative, Positive
+from lsvision.types.line_motion import LineFinding, LineMotion
 from lsvision.types.scan import Rig
 
 CalibrationMethod = Literal["joint", "two_step", "sequential", "least_squares"]
+# Whether the motion from line to line is part of a calibration where the boards show one.
+WhetherLineMotion = Literal["auto", "none"]
 # What a calibration is worth, the first that holds from the right: see ``Calibration``.
 Verdict = Literal["determined", "prior-dominated", "inconsistent", "not converged"]
 # Verdicts without a usable n, as an option names them that uses one all the same.
@@ -30,7 +33,8 @@ class BoardCorners:
     """The corners of one board in one scan, measured and true.
 
     ``points`` are the measured ``(x, travel, z)`` of every corner in the order of ``board_points``; ``covariance`` is
-    theirs, mm². A corner with ``valid`` false was not seen; its point is NaN.
+    theirs, mm². A corner with ``valid`` false was not seen; its point is NaN. ``travel_mm`` is the travel of every line
+    of the scan, where that is known.
     """
 
     scan: str
@@ -40,6 +44,7 @@ class BoardCorners:
     board_points: Float[Tensor, "corners 3"]
     left_px: Float[Tensor, "corners 2"]
     right_px: Float[Tensor, "corners 2"] | None = None
+    travel_mm: Float[Tensor, " lines"] | None = None
 
 
 @dataclass(frozen=True)
@@ -81,7 +86,9 @@ class BoardFit:
 
     ``corners`` is how many were used. ``reduced_chi_square`` compares their residuals after with their given
     covariance: 1 where they are as expected; ``largest_residual`` is that of one corner, in sigmas; None where they are
-    not known. ``outliers`` are the corners left out, as (column, row) from 1 at the board's origin.
+    not known. ``outliers`` are the corners left out, as (column, row) from 1 at the board's origin. ``line_motion`` is
+    what was found of the motion from line to line, and empty where there is none; its values are in the file of that
+    name.
     """
 
     scan: str
@@ -92,6 +99,8 @@ class BoardFit:
     reduced_chi_square: float | None = None
     outliers: tuple[tuple[int, int], ...] = ()
     largest_residual: float | None = None
+    line_motion: tuple[LineFinding, ...] = ()
+    line_motion_file: str | None = None
 
 
 @dataclass(frozen=True)
@@ -156,6 +165,8 @@ class Calibration:
     ``notes`` what else was noticed and allowed for.
     ``noise_scale`` is how many times larger than the corners' given covariance their residuals are, 1 where they are as
     expected; the covariance of n allows for it, and for the ``errors_along_scan`` that the residuals show.
+    ``line_motions`` are these line by line, for every board's scan, and empty where they are not part of the result;
+    the RMSE after is then without them.
     """
 
     method: CalibrationMethod
@@ -172,6 +183,7 @@ class Calibration:
     converged: bool = True
     noise_scale: float = 1.0
     errors_along_scan: tuple[ErrorAlongScan, ...] = ()
+    line_motions: tuple[LineMotion, ...] = ()
     provenance: Provenance = field(default_factory=lambda: Provenance("", ""))
 
     @property

@@ -7,19 +7,24 @@ the noise that the errors make), and ``search``, ``Linearised``, ``latents`` (on
 from lsvision.stages.calibration.along_scan.check import SUSPICION, by_chance
 from lsvision.stages.calibration.along_scan.errors import ErrorsAlongScan, errors_along_scan, with_processes
 from lsvision.stages.calibration.along_scan.evidence import Linearised
+from lsvision.stages.calibration.along_scan.kernels import SEARCHED
 from lsvision.stages.calibration.along_scan.lines import COMPONENTS, latents
+from lsvision.stages.calibration.along_scan.posterior import Processes, processes_given_corners
 from lsvision.stages.calibration.along_scan.search import Beforehand, FoundErrors, search
 
 __all__ = [
     "COMPONENTS",
+    "SEARCHED",
     "SUSPICION",
     "Beforehand",
     "ErrorsAlongScan",
     "FoundErrors",
     "Linearised",
+    "Processes",
     "by_chance",
     "errors_along_scan",
     "latents",
+    "processes_given_corners",
     "search",
     "with_processes",
 ]
