@@ -15,6 +15,7 @@ from lsvision.schema import Text
 from lsvision.stages.calibration.calibrate import calibrate
 from lsvision.stages.calibration.config import CalibrationConfig
 from lsvision.stages.corners.config import CornersConfig
+from lsvision.stages.corners.edges import find_edges
 from lsvision.stages.corners.find import find_corners
 from lsvision.stages.corners.rows import row_difference
 from lsvision.types import Board, BoardCorners, Calibration, MissingLines, Provenance, Scan
@@ -46,7 +47,7 @@ def run_calibrate(settings: CalibrateSettings, folder: Path) -> None:
     """
     scans = read_scans(settings.scans, settings.missing_lines)
     boards = find_boards(scans, settings.board, settings.corners)
-    calibration = calibrate(boards, scans[0].rig, settings.calibration)
+    calibration = calibrate_with_edges(scans, boards, settings.board, settings.calibration)
     provenance = Provenance(
         version=__version__,
         config_sha256=settings_sha256(settings),
@@ -60,6 +61,22 @@ def run_calibrate(settings: CalibrateSettings, folder: Path) -> None:
     log.info("%s\nwrote %s and %s", calibration_summary(calibration), target, folder / "report.html")
     if not calibration.usable:
         raise UnusableCalibrationError(str(target), calibration.verdict, calibration.reasons)
+
+
+def calibrate_with_edges(
+    scans: Sequence[Scan], boards: Sequence[BoardCorners], board: Board, config: CalibrationConfig
+) -> Calibration:
+    """Calibrate from the corners; where they show that the boards shook, from the edges on every line as well."""
+    calibration = calibrate(boards, scans[0].rig, config)
+    if not calibration.errors_along_scan or config.line_motion == "none":
+        return calibration
+    with progress_bars() as bars:
+        bar = bars.start("find edges", total=len(scans))
+        edges = []
+        for scan, corners in zip(scans, boards, strict=True):
+            edges.append(find_edges(scan, board, corners))
+            bars.advance(bar)
+    return calibrate(boards, scans[0].rig, config, edges)
 
 
 def write_line_motions(calibration: Calibration, target: Path) -> Calibration:

@@ -7,6 +7,7 @@ frame C, product frame M.
 
 from lsvision.types.calibration import (
     BoardCorners,
+    BoardEdges,
     BoardFit,
     Calibration,
     CalibrationMethod,
@@ -47,6 +48,7 @@ __all__ = [
     "LINE_COMPONENTS",
     "Board",
     "BoardCorners",
+    "BoardEdges",
     "BoardFit",
     "Calibration",
     "CalibrationMethod",

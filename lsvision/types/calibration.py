@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from lsvision.schema import NonNegative, Positive
@@ -45,6 +45,26 @@ class BoardCorners:
     left_px: Float[Tensor, "corners 2"]
     right_px: Float[Tensor, "corners 2"] | None = None
     travel_mm: Float[Tensor, " lines"] | None = None
+
+
+@dataclass(frozen=True)
+class BoardEdges:
+    """Where lines of a scan cross the edges of a board's squares, in both images.
+
+    A crossing is a point of the straight edge from ``start`` to ``stop`` in the board frame, mm, but it is not known
+    which. ``points`` are the measured (x, travel, z), mm; ``by_column`` is the derivative of (x, z) by the mean of the
+    columns in both images and by the disparity, mm/px; ``sigma_px`` is how well single crossings are located, up to a
+    common factor. ``segment`` is a number of the edge, ``line`` that of the line.
+    """
+
+    scan: str
+    points: Float[Tensor, "crossings 3"]
+    by_column: Float[Tensor, "crossings 2 2"]
+    sigma_px: Float[Tensor, " crossings"]
+    start: Float[Tensor, "crossings 3"]
+    stop: Float[Tensor, "crossings 3"]
+    segment: Int[Tensor, " crossings"]
+    line: Int[Tensor, " crossings"]
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,8 @@ _STEEPEST = 2.0  # columns per line: a flatter edge is a blur along the line
 _BLURS = 4.0  # half width of the fitted window
 _LEAST_HALF, _MOST_HALF = 4, 12  # px
 _ITERATIONS = 8
-_FIRST_BLUR, _LEAST_BLUR, _LARGEST_BLUR = 0.9, 0.15, 4.0  # px
+_FIRST_BLUR, _BLUR_STEP, _BLURS_TRIED = 0.3, 1.2, 13  # px; that many times larger the next; how many
+_BLUR_PROFILES = 2000  # of which the blur is taken
 _LEAST_STEP = 0.4  # of the median step between dark and bright
 _LARGEST_MISFIT = 4.0  # times the median misfit
 
@@ -106,21 +107,17 @@ def find_crossings(
 
 
 def _steepest(wide: Float[Tensor, "crossings size"], around: int) -> Int[Tensor, " crossings"]:
-    """Where, from the middle, brightness changes most over four pixels: from the darker to the brighter side."""
-    total = torch.nn.functional.pad(wide, (1, 0)).cumsum(-1)
-    k = 2
-    ahead, behind = total[:, 2 * k :] - total[:, k:-k], total[:, k:-k] - total[:, : -2 * k]
-    change = ahead - behind  # between pixel i + k - 1 and i + k
-    middle = wide.shape[-1] // 2
-    part = change[:, middle - around - k : middle + around - k + 1]
-    sign = torch.sign(part.gather(1, part.abs().argmax(-1, keepdim=True)))
-    return (sign * part).argmax(-1) - around
+    """The pixel, counted from the middle, at which brightness changes most over four pixels."""
+    change = wide[:, 2:-1] + wide[:, 3:] - wide[:, :-3] - wide[:, 1:-2]  # at i, between pixels i + 1 and i + 2
+    middle = wide.shape[-1] // 2 - 2
+    part = change[:, middle - around : middle + around + 1]
+    return part.abs().argmax(-1) - around
 
 
 def _fitted(profiles: Tensor, slant: Tensor, coarse: Tensor, seen: Tensor) -> Crossings:
     """Position, blur, level and step of every profile by Gauss-Newton."""
     offset = torch.arange(-_MOST_HALF, _MOST_HALF + 1, dtype=profiles.dtype)
-    blur = _typical_blur(profiles[seen], slant[seen], offset) if bool(seen.any()) else _FIRST_BLUR
+    blur = _typical_blur(profiles[seen], slant[seen], offset) if bool(seen.any()) else 1.0
     half = min(_MOST_HALF, max(_LEAST_HALF, math.ceil(_BLURS * blur)))
     inner = slice(_MOST_HALF - half, _MOST_HALF + half + 1)
     fit = _gauss_newton(profiles[:, inner], slant, offset[inner], blur)
@@ -135,14 +132,16 @@ def _fitted(profiles: Tensor, slant: Tensor, coarse: Tensor, seen: Tensor) -> Cr
 
 
 def _typical_blur(profiles: Tensor, slant: Tensor, offset: Tensor) -> float:
-    """Median blur of some profiles."""
-    some = torch.linspace(0, len(profiles) - 1, min(len(profiles), 2000)).long()
-    tried = torch.tensor([0.3 * 1.25**k for k in range(11)], dtype=profiles.dtype)
-    middle = slice(_MOST_HALF - 8, _MOST_HALF + 9)
+    """The blur that fits most of some profiles best: of a few sizes, then between them."""
+    some = torch.linspace(0, len(profiles) - 1, min(len(profiles), _BLUR_PROFILES)).long()
+    tried = _FIRST_BLUR * _BLUR_STEP ** torch.arange(_BLURS_TRIED, dtype=profiles.dtype)
     misfit = torch.stack(
-        [_gauss_newton(profiles[some][:, middle], slant[some], offset[middle], float(b))[:, 1] for b in tried]
-    )
-    return float(tried[misfit.nanmedian(-1).values.argmin()])
+        [_gauss_newton(profiles[some], slant[some], offset, float(blur))[:, 1].nanmedian() for blur in tried]
+    ).square()
+    best = int(misfit.argmin().clamp(1, _BLURS_TRIED - 2))
+    before, here, after = misfit[best - 1 : best + 2].tolist()
+    part = 0.5 * (before - after) / max(before - 2.0 * here + after, 1e-12)
+    return float(tried[best]) * _BLUR_STEP ** max(-1.0, min(1.0, part))
 
 
 def _gauss_newton(profiles: Tensor, slant: Tensor, offset: Tensor, blur: float) -> Tensor:

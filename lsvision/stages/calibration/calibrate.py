@@ -23,17 +23,25 @@ from lsvision.stages.calibration.noise import board_chi_square
 from lsvision.stages.calibration.observability import Known, observe
 from lsvision.stages.calibration.solved import Solution, solve
 from lsvision.stages.calibration.verdict import UNLIKE, judge, not_settled, rmse_grew
-from lsvision.types import BoardCorners, BoardFit, Calibration, LineMotion, Motion, Pose, Rig
+from lsvision.stages.calibration.with_edges import with_edges
+from lsvision.types import BoardCorners, BoardEdges, BoardFit, Calibration, LineMotion, Motion, Pose, Rig
 
 __all__ = ["BatchCalibration", "CalibrationConfig", "calibrate", "calibrate_batch"]
 
 
-def calibrate(boards: Sequence[BoardCorners], rig: Rig, config: CalibrationConfig) -> Calibration:
+def calibrate(
+    boards: Sequence[BoardCorners],
+    rig: Rig,
+    config: CalibrationConfig,
+    edges: Sequence[BoardEdges | None] | None = None,
+) -> Calibration:
     """Motion n and board poses from the corners of one or more board scans.
 
     Args:
         boards: corners of each scan; several scans may be of one board.
         rig: the cameras that made the scans; copied into the result.
+        edges: of the squares of each board, on every line. They are used where the corners show that the boards shook:
+            what the lines did is then known between the corners too.
 
     Raises:
         CalibrationError: no boards; a board with fewer than six valid corners, corners on one line, or values or
@@ -53,6 +61,9 @@ def calibrate(boards: Sequence[BoardCorners], rig: Rig, config: CalibrationConfi
     findings = find_flaws(boards, solution.problem, solution.start, solution.outlying, assumed, shaken)
     if findings.contradictions and shaken:  # they are no errors along the scan
         solution = solve(measured, replace(config, correlated_odds=math.inf))
+        shaken = bool(solution.along_scan.found)
+    if shaken and edges is not None and solution.corrects_lines:
+        solution = with_edges(solution, edges)
     batch, scale = solution.summary(), float(solution.noise_scale)
     if int(batch.info) == Info.SINGULAR:
         raise CalibrationError(

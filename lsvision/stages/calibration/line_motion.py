@@ -20,6 +20,7 @@ from lsvision.types import LINE_COMPONENTS, LineComponent, LineFinding, LineMoti
 
 _LINES_AT_ONCE = 4096
 _OBSERVED = 0.7  # share of a component's size that its sigma on the lines of the board may be
+_FAINT = 0.01  # of the largest component: less may be what the corners err by together
 _UNSEEN = "the rows of corners are too far apart: turn the board by 20 to 45 deg in its plane; known no"
 _COMPONENT: dict[LineComponent, int] = {
     "dx": COMPONENTS.index("x"),
@@ -46,7 +47,7 @@ class FoundProcesses:
     @property
     def present(self) -> list[bool]:
         """Which components, in the order of ``LINE_COMPONENTS``, the data give evidence for."""
-        evident = self.log_ratio > math.log(self.odds)
+        evident = (self.log_ratio > math.log(self.odds)) & (self.rms_mm > _FAINT * self.rms_mm.max())
         return [bool(evident[_COMPONENT[name]]) for name in LINE_COMPONENTS]
 
     def usual(self, name: LineComponent) -> float:

@@ -11,7 +11,13 @@ from torch import Tensor
 
 from lsvision.errors import ConfigError
 from lsvision.estimation import Info, Posterior
-from lsvision.stages.calibration.along_scan import ErrorsAlongScan, Linearised, Processes, processes_given_corners
+from lsvision.stages.calibration.along_scan import (
+    EdgeRows,
+    ErrorsAlongScan,
+    Linearised,
+    Processes,
+    processes_given_corners,
+)
 from lsvision.stages.calibration.batch import BatchCalibration
 from lsvision.stages.calibration.config import CalibrationConfig
 from lsvision.stages.calibration.measurements import BoardMeasurements, SoundProblem
@@ -41,6 +47,7 @@ class Solution:
     scatter: Float[Tensor, "*batch"]
     along_scan: ErrorsAlongScan
     config: CalibrationConfig
+    edges: EdgeRows | None = None
 
     @property
     def weighed(self) -> BoardProblem:
@@ -72,7 +79,9 @@ class Solution:
         """
         problem, scale = self.problem.at(place), self.noise_scale[place]
         linearised = Linearised.of(problem, self.posterior.mean[place], self.config.prior_sigma)
-        return processes_given_corners(problem.scaled(scale), linearised, self.along_scan.variances[place], reach)
+        return processes_given_corners(
+            problem.scaled(scale), linearised, self.along_scan.variances[place], reach, self.edges
+        )
 
     def rmse_with_lines_as_they_are(self) -> Float[Tensor, "*batch"]:
         """RMSE, mm, at the solution, the motion of the lines not taken away."""

@@ -8,6 +8,7 @@ from torch import Tensor
 
 from lsvision.estimation.gaussian_process import covariance_root
 from lsvision.stages.calibration.along_scan.check import SUSPICION, can_be
+from lsvision.stages.calibration.along_scan.edges import EdgeRows
 from lsvision.stages.calibration.along_scan.evidence import Linearised
 from lsvision.stages.calibration.along_scan.kernels import FINE, SEARCHED, Knots, kernel_family, wave_length
 from lsvision.stages.calibration.along_scan.lines import COMPONENTS, Travel, latents
@@ -93,14 +94,20 @@ def _covariance(errors: FoundErrors, travel: Travel, known: Beforehand, knots: K
 
 
 def with_processes(
-    problem: BoardProblem, roots: Float[Tensor, "_ 4 knots columns"], knots: Knots = FINE
+    problem: BoardProblem,
+    roots: Float[Tensor, "_ 4 knots columns"],
+    knots: Knots = FINE,
+    edges: EdgeRows | None = None,
 ) -> CorrelatedNoise:
     """The noise of a problem's corners and of a process per board and component, given by its root at the knots, mm.
+
+    Edges of the boards are measured besides.
 
     Args:
         problem: of batch shape ().
     """
     features = affine_features(problem.body_points)
     by_latents = latents(problem, roots, knots)
-    noise = rows_with_latents(problem.noise_chol, problem.points, features, problem.valid, by_latents)
-    return CorrelatedNoise(noise.rows, problem.noise_log_det + noise.log_det)
+    further = None if edges is None else edges.on_latents(roots, knots)
+    noise = rows_with_latents(problem.noise_chol, problem.points, features, problem.valid, by_latents, further)
+    return replace(noise, log_det=problem.noise_log_det + noise.log_det, further=0.0 if edges is None else edges.values)

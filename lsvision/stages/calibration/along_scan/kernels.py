@@ -29,6 +29,7 @@ _ROUGH_LENGTHS = (0.25, 0.5)
 _SMOOTH_LENGTHS = (0.0625, 0.125, 0.25, 0.5)
 # Waves per unit. Of those that soon lose their phase, neighbours nearer than a quarter look alike.
 _FADING_FREQUENCIES = (0.25, 0.35, 0.5, *(0.25 * k for k in range(3, 17)))
+_SHORT_FREQUENCIES = tuple(0.25 * k for k in range(17, 33))  # which only finer knots describe, and edges show
 _LASTING_FREQUENCIES = tuple(0.25 * 2.0 ** (k / 6) for k in range(25))
 _FADING, _LASTING = 2.0, 8.0  # coherence of waves: how far one keeps its phase
 _FADING_RANK, _LASTING_RANK = 16, 8  # of their covariances, the rest of which is rounding
@@ -96,32 +97,35 @@ FINE = Knots(density=2)
 @cache
 def kernel_family(knots: Knots = SEARCHED) -> KernelFamily:
     """All kernels: broad-band errors and waves are as probable, and so are waves that fade and that last."""
-    groups = _correlations(knots)
-    ranks = (knots.count, _FADING_RANK, _LASTING_RANK)
+    broad, fading, lasting, short = _correlations(knots)
+    groups, ranks = [broad, fading, lasting], [knots.count, _FADING_RANK, _LASTING_RANK]
+    parts = [0.5, 0.25, 0.25]
+    if knots.density > 1:
+        groups, ranks = [*groups, short], [*ranks, _FADING_RANK]
+        parts = [*parts, 0.25 * len(short) / len(fading)]
     roots = tuple(covariance_root(group)[..., -rank:] for group, rank in zip(groups, ranks, strict=True))
     share = torch.cat(
-        [
-            group.new_full((len(group),), part / len(group))
-            for group, part in zip(groups, (0.5, 0.25, 0.25), strict=True)
-        ]
+        [group.new_full((len(group),), part / len(group)) for group, part in zip(groups, parts, strict=True)]
     )
     return KernelFamily(torch.cat(groups), roots, share.log())
 
 
 def covariance_of(variances: Float[Tensor, "*batch kernels"], knots: Knots) -> Float[Tensor, "*batch knots knots"]:
     """Covariance at knots of a sum of processes of all kernels, each of some variance, mm²."""
-    return torch.tensordot(variances, torch.cat(_correlations(knots)).to(variances), 1)
+    correlation = torch.cat(_correlations(knots)).to(variances)
+    return torch.tensordot(variances, correlation[: variances.shape[-1]], 1)
 
 
 def _correlations(knots: Knots) -> list[Float[Tensor, "_ knots knots"]]:
-    """All kernels between knots: broad-band ones, waves that fade, waves that last."""
+    """All kernels between knots: broad-band ones, waves that fade, waves that last, short waves that fade."""
     place = knots.place(torch.zeros((), dtype=torch.float64))
     distance = place[:, None] - place
     rough = [exponential(distance / length) for length in _ROUGH_LENGTHS]
     broad = rough + [matern32(distance / length) for length in _SMOOTH_LENGTHS]
     fading = [narrow_band(distance, 1.0 / frequency, _FADING) for frequency in _FADING_FREQUENCIES]
     lasting = [narrow_band(distance, 1.0 / frequency, _LASTING) for frequency in _LASTING_FREQUENCIES]
-    return [torch.stack(group) for group in (broad, fading, lasting)]
+    short = [narrow_band(distance, 1.0 / frequency, _FADING) for frequency in _SHORT_FREQUENCIES]
+    return [torch.stack(group) for group in (broad, fading, lasting, short)]
 
 
 def wave_length(covariance: Float[Tensor, "*batch knots knots"]) -> Float[Tensor, "*batch"]:

@@ -5,14 +5,16 @@ reduced by one QR to rows on its processes and its pose, and a few on n, which a
 together goes back into each board. Poses and n are so marginalised, not taken as known.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.nn.functional import pad
 
 from lsvision.estimation import solve_upper, upper_root
 from lsvision.estimation.gaussian_process import covariance_root
+from lsvision.stages.calibration.along_scan.edges import EdgeRows
 from lsvision.stages.calibration.along_scan.evidence import Linearised
 from lsvision.stages.calibration.along_scan.kernels import FINE, Knots, covariance_of
 from lsvision.stages.calibration.along_scan.lines import COMPONENTS, Lever, Travel, latents
@@ -39,6 +41,12 @@ class Processes:
         """Weights of the knots of one board at lines of some travel; those too far away get that of the last knot."""
         return self.knots.weights((travel_mm - self.travel.start_mm[board]) / self.travel.extent_mm)
 
+    def bend(self) -> "Processes":
+        """The second derivative of the mean by the travel, 1/mm, in its place."""
+        step = self.travel.extent_mm / self.knots.intervals
+        inner = self.mean[..., 2:] - 2.0 * self.mean[..., 1:-1] + self.mean[..., :-2]
+        return replace(self, mean=pad(inner / step.square(), (1, 1)))
+
     def displaced(self, points: Float[Tensor, "boards corners 3"]) -> Float[Tensor, "boards corners 3"]:
         """What measured points, mm, of each board were displaced by in the mean, mm."""
         weights = torch.stack([self.weights(board, travel) for board, travel in enumerate(points[..., 1])])
@@ -50,6 +58,7 @@ def processes_given_corners(
     linearised: Linearised,
     variances: Float[Tensor, "4 kernels"],
     reach: Float[Tensor, "boards 2"] | None = None,
+    edges: EdgeRows | None = None,
 ) -> Processes:
     """Posterior of the processes of each board.
 
@@ -58,6 +67,7 @@ def processes_given_corners(
         linearised: about the solution.
         variances: of the kernels of each component, mm².
         reach: least and greatest travel, mm, of each scan; that of the corners if None.
+        edges: of the boards.
     """
     travel = Travel.of(problem)
     knots = FINE if reach is None else _knots(travel, reach)
@@ -66,6 +76,10 @@ def processes_given_corners(
     columns = torch.cat([by_latents, linearised.columns], dim=-1)
     white = torch.linalg.solve_triangular(problem.noise_chol, columns, upper=False)
     white = torch.where(problem.valid[..., None, None], white, 0.0).flatten(1, 2)
+    if edges is not None:
+        further = edges.on_latents(roots[None].expand(problem.boards, -1, -1, -1), knots)
+        rows = torch.cat([further[..., : by_latents.shape[-1]], linearised.of_edges(further)], dim=-1)
+        white = torch.cat([white, rows], dim=1)
     mean, factor = _of_latents(white, by_latents.shape[-1], linearised.prior)
     mean, factor = (part.unflatten(1, (len(COMPONENTS), -1)) for part in (mean, factor))
     return Processes(travel, Lever.of(problem), knots, (roots @ mean[..., None])[..., 0], roots @ factor)

@@ -128,16 +128,9 @@ class _Search:
                 for component, weighed in zip(order, first, strict=True):
                     if weighed.present > _THERE:
                         self._weigh(component, layer, self.family.log_prior)
-        covariance = self.covariances.sum(1) + self.walk
-        with_all = self._log_evidence(covariance)
-        without = [self._log_evidence(_without(covariance, component)) for component in range(_COUNT)]
-        log_ratio = with_all - torch.stack(without)
+        evidence, log_ratio = evidence_by_component(self.equations, self.covariances.sum(1) + self.walk)
         rms = torch.minimum(self.rms_mm.square().sum(-1).sqrt(), _SHOWN * self.equations.rms_mm)
-        return FoundErrors(self.variances.sum(1), log_ratio, rms, float(with_all))
-
-    def _log_evidence(self, covariance: Tensor) -> Tensor:
-        """The log evidence for errors of some covariance at the knots."""
-        return self.equations.log_evidence(*self._present(covariance))
+        return FoundErrors(self.variances.sum(1), log_ratio, rms, float(evidence))
 
     def _weigh_first(self, component: int) -> "_Weighed":
         """Weigh the first process of a component."""
@@ -166,13 +159,8 @@ class _Search:
         """Log likelihood ratios of a process of each kernel and amplitude to none, the others as they stand."""
         standing = self.covariances.clone()
         standing[component, layer] = 0.0
-        given = self.equations.given(component, *self._present(standing.sum(1) + self.walk))
+        given = self.equations.given(component, *_present(standing.sum(1) + self.walk))
         return self.equations.log_ratios(given, self.family, self._variances(component))
-
-    def _present(self, covariance: Tensor) -> tuple[Tensor, Tensor]:
-        """Which components err at all, and the roots of their covariances."""
-        present = covariance.flatten(-2).any(-1).any(0).nonzero()[:, 0]
-        return present, covariance_root(covariance[:, present])
 
     def _variances(self, component: int) -> Tensor:
         """The variances to try, mm²."""
@@ -187,11 +175,23 @@ class _Search:
         return prior + torch.logaddexp(ratio + math.log(_SHARED), prior.new_tensor(math.log(1.0 - _SHARED)))
 
 
-def _without(covariance: Tensor, component: int) -> Tensor:
-    """A covariance in which one component does not err."""
-    rest = covariance.clone()
-    rest[:, component] = 0.0
-    return rest
+def evidence_by_component(
+    equations: NormalEquations, covariance: Float[Tensor, "_ 4 knots knots"]
+) -> tuple[Float[Tensor, ""], Float[Tensor, "4"]]:
+    """The log evidence for errors of some covariance, mm², and how much of it is lost without each component."""
+    evidence = equations.log_evidence(*_present(covariance))
+    without = []
+    for component in range(_COUNT):
+        rest = covariance.clone()
+        rest[:, component] = 0.0
+        without.append(equations.log_evidence(*_present(rest)))
+    return evidence, evidence - torch.stack(without)
+
+
+def _present(covariance: Tensor) -> tuple[Tensor, Tensor]:
+    """Which components err at all, and the roots of their covariances."""
+    present = covariance.flatten(-2).any(-1).any(0).nonzero()[:, 0]
+    return present, covariance_root(covariance[:, present])
 
 
 @dataclass(frozen=True)
