@@ -34,6 +34,7 @@ _EXPLAINED = 0.5  # share of a detail that its match must explain
 # What a detail must have beyond noise: so many times its noise, and as large a part of the squared slopes.
 _ALONG_NOISE, _ALONG_SLOPE = 0.5, 0.6
 _SHARP_NOISE, _SHARP_SLOPE = 1.0, 0.5
+_LIKE_SHIFT = 0.6  # correlation of the texture's slopes with the column that covers the errors of rendered rails
 
 
 def light_is_suspect(
@@ -78,14 +79,27 @@ def _differing_share(left: Tensor, right: Tensor, disparity: Tensor) -> float:
     return float(differing.sum()) / max(int(matched.sum()), 1)
 
 
+@dataclass(frozen=True)
+class DetailProof:
+    """What details of the surface say about a match in suspect light.
+
+    Attributes:
+        proven: whether windows show such details, and the match explains most of them.
+        variance: of the disparity by the light that changes along the line within a window, px².
+    """
+
+    proven: Bool[Tensor, "rows columns"]
+    variance: Float[Tensor, "rows columns"]
+
+
 def proven_by_detail(
     left: Shaped[Tensor, "lines width"],
     right: Shaped[Tensor, "lines right_width"],
     disparity: Float[Tensor, "rows columns"],
     noise_variance: Float[Tensor, "rows columns"],
     window: int,
-) -> Bool[Tensor, "rows columns"]:
-    """Where windows show details of the surface, and the match explains most of them.
+) -> DetailProof:
+    """Where windows show details of the surface that the match explains, and what light adds to its variance.
 
     Either the slopes of the grey values change along the scan, over four lines, or they change sharply along the line,
     from one pixel to the next. Both must be more than noise and, light has slopes, a good part of the squared slopes.
@@ -97,17 +111,18 @@ def proven_by_detail(
         window: side of the windows, blocks.
     """
     block = block_side(left, disparity)
-    proven = torch.zeros_like(disparity, dtype=torch.bool)
+    proof = DetailProof(torch.zeros_like(disparity, dtype=torch.bool), torch.zeros_like(disparity))
 
     def prove(rows: HaloRange) -> None:
         """Prove some rows of blocks."""
         images = [whole_blocks(image, rows.outer, block) for image in (left, right)]
-        detail = _Detail.of(images[0], images[1], disparity[rows.outer], window)
-        proven[rows.start : rows.stop] = detail.proven(noise_variance[rows.outer])[rows.inner]
+        part = _Detail.of(images[0], images[1], disparity[rows.outer], window).proof(noise_variance[rows.outer])
+        proof.proven[rows.start : rows.stop] = part.proven[rows.inner]
+        proof.variance[rows.start : rows.stop] = part.variance[rows.inner]
 
     halo = window // 2 + _APART // block
     in_parallel(prove, halo_ranges(disparity.shape[0], _TILE_LINES // block, halo))
-    return proven
+    return proof
 
 
 @dataclass(frozen=True)
@@ -126,8 +141,8 @@ class _Detail:
         warped = warp_cubic(right, enlarged(torch.nan_to_num(disparity), block))
         return cls(left, left - warped, disparity == disparity, window)
 
-    def proven(self, noise: Tensor) -> Tensor:
-        """Which windows prove their match, from the variance of the noise of an image."""
+    def proof(self, noise: Tensor) -> DetailProof:
+        """What windows prove, from the variance of the noise of an image."""
         block = block_side(self.left, self.matched)
         left, residual = _slopes(self.left), _slopes(self.residual)
         reach = _APART // 2 // block
@@ -139,7 +154,19 @@ class _Detail:
         sharp = _Energy.of(across, _curvature(self.left), _curvature(self.residual), noise * _OF_CURVATURE)
         changing = slopes.exceeds(_ALONG_NOISE, _ALONG_SLOPE * texture) & slopes.is_explained()
         edges = sharp.exceeds(_SHARP_NOISE, _SHARP_SLOPE * texture) & sharp.is_explained()
-        return (changing | edges) & values.is_explained(least=2.0 * values.noise)
+        proven = (changing | edges) & values.is_explained(least=2.0 * values.noise)
+        return DetailProof(proven, self._light_variance(texture, noise))
+
+    def _light_variance(self, texture: Tensor, noise: Tensor) -> Tensor:
+        """Variance of the disparity, px², by the slope of the light: least squares take it for a shift of texture."""
+        windows, reach, block = self._windows(0, 0), self.window // 2, block_side(self.left, self.matched)
+        mean = windows.mean(self.residual)
+        apart = 2 * reach * block
+        slope = F.pad(mean[:, 2 * reach :] - mean[:, : -2 * reach], (reach, reach)).div_(apart)
+        own = noise * (2 * RESIDUAL_NOISE / (self.window * block * apart) ** 2)
+        light = slope.square_().sub_(own).clamp_(min=0)
+        spread = ((self.window * block) ** 2 - 1) / 12.0  # variance of the columns of a window
+        return light.mul_(_LIKE_SHIFT**2 * spread).div_(torch.maximum(texture, noise))
 
     def _windows(self, rows: int, columns: int) -> Windows:
         """Windows of the blocks that match and whose neighbours at a distance do."""

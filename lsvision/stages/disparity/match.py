@@ -154,11 +154,11 @@ def _measure(
         texture_confidence=config.texture_confidence,
     )
     refined = refine_disparity(left, right, disparity, options)
-    own = refined.disparity
+    own, light_variance = refined.disparity, None
     if light_is_suspect(left, right, own, unusable):
         noise = (refined.residual_variance / RESIDUAL_NOISE).clamp_(max=options.noise**2)
-        window = options.window_blocks(block)
-        own = own.masked_fill(~proven_by_detail(left, right, own, noise, window), torch.nan)
+        proof = proven_by_detail(left, right, own, noise, options.window_blocks(block))
+        own, light_variance = own.masked_fill(~proof.proven, torch.nan), proof.variance
     own = without_speckles(own, _LEFT_OVER * config.speckle_px)
     misfit = Misfit.of(refined.residual_variance, block)
     factor = misfit.factor
@@ -166,6 +166,8 @@ def _measure(
         factor = factor * holes_factor(searched, disparity, options.window_blocks(block))
     lowest_px = float(disparity_range(rig, config)[0])
     variance = other_side_variance(left, right, own, misfit.noise_variance, lowest_px)
+    if light_variance is not None:
+        variance.add_(light_variance)
     sigma = variance.addcmul_(factor, refined.sigma.square()).sqrt_().add_(own - own)  # NaN where the disparity is
     return StripMatch(enlarged(own, block)[:lines, :width], repeated(sigma, block)[:lines, :width])
 

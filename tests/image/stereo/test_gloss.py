@@ -43,7 +43,7 @@ def proven(left: torch.Tensor, right: torch.Tensor, disparity: float = DISPARITY
     blocks = torch.full((LINES // block, WIDTH // block), disparity)
     found = proven_by_detail(
         noisy(left, 1), noisy(right, 2), blocks, torch.full_like(blocks, 1.25 * NOISE**2), 2 * (9 // (2 * block)) + 1
-    )
+    ).proven
     return found[:, 16 // block : -16 // block]
 
 
@@ -82,9 +82,9 @@ def test_what_does_not_match_proves_nothing_about_its_neighbours():
     part = whole.clone()
     part[:, 100:] = torch.nan
     noise = torch.ones_like(whole)
-    alone = proven_by_detail(left, right, whole, noise, 9)
+    alone = proven_by_detail(left, right, whole, noise, 9).proven
     left[:, 100:] = 255.0
-    found = proven_by_detail(left, right, part, noise, 9)
+    found = proven_by_detail(left, right, part, noise, 9).proven
     assert torch.equal(found[:, :95], alone[:, :95])
     assert found[:, 95:99].float().mean() > 0.7
     assert not found[:, 105:].any()
@@ -114,7 +114,7 @@ def test_images_of_odd_sizes():
     left, right = grain(0.0)[:-1, :-1], grain(DISPARITY)[:-1, :-1]
     disparity = everywhere(2)
     assert not light_is_suspect(left, right, disparity, NONE)
-    found = proven_by_detail(left, right, disparity, torch.ones_like(disparity), 5)
+    found = proven_by_detail(left, right, disparity, torch.ones_like(disparity), 5).proven
     assert found[:, 16:-8].float().mean() > 0.85
 
 
@@ -125,5 +125,23 @@ def test_tiles_leave_no_trace():
     cut = 64  # lines by which the tiles are moved
     whole = proven_by_detail(left, right, disparity, noise, 9)
     later = proven_by_detail(left[cut:], right[cut:], disparity[cut:], noise[cut:], 9)
-    assert 0.2 < whole.float().mean() < 0.9
-    assert torch.equal(whole[cut + 8 :], later[8:])
+    assert 0.2 < whole.proven.float().mean() < 0.9
+    assert torch.equal(whole.proven[cut + 8 :], later.proven[8:])
+    assert torch.equal(whole.variance[cut + 8 :], later.variance[8:])
+
+
+@pytest.mark.parametrize("block", [1, 2])
+def test_light_that_changes_along_the_line_adds_to_the_variance(block):
+    """A slope of g grey values a px, over s of the texture, looks like a shift of g / s times the columns' spread."""
+    slope, disparity = 0.8, everywhere(block)
+    left, right = noisy(grain(0.0), 1), noisy(grain(DISPARITY), 2)
+    noise, size = torch.full_like(disparity, 1.25 * NOISE**2), 2 * (9 // (2 * block)) + 1
+    inner = slice(32 // block, -16 // block)
+    even, sloped = (
+        proven_by_detail(left + light, right, disparity, noise, size).variance[:, inner].sqrt().median()
+        for light in (0.0, slope * COLUMN)
+    )
+    texture = 0.5 * (grain(0.0)[:, 2:] - grain(0.0)[:, :-2])
+    spread = (((size * block) ** 2 - 1) / 12) ** 0.5
+    assert even < 0.005
+    assert 0.6 * spread * slope / texture.std() == pytest.approx(float(sloped), rel=0.3)
