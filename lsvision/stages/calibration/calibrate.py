@@ -62,8 +62,10 @@ def calibrate(
     if findings.contradictions and shaken:  # they are no errors along the scan
         solution = solve(measured, replace(config, correlated_odds=math.inf))
         shaken = bool(solution.along_scan.found)
+    by_edges: tuple[str, ...] = ()
     if shaken and edges is not None and solution.corrects_lines:
-        solution = with_edges(solution, edges)
+        by_corners, solution = solution, with_edges(solution, edges)
+        by_edges = _what_edges_did(by_corners, solution)
     batch, scale = solution.summary(), float(solution.noise_scale)
     if int(batch.info) == Info.SINGULAR:
         raise CalibrationError(
@@ -95,7 +97,7 @@ def calibrate(
         rig=rig,
         verdict=judged.verdict,
         reasons=judged.reasons,
-        notes=findings.notes if along_scan else (*findings.notes, *findings.shake),
+        notes=(*findings.notes, *(by_edges if along_scan else findings.shake)),
         converged=converged,
         noise_scale=scale,
         errors_along_scan=along_scan,
@@ -122,6 +124,15 @@ def calibrate_batch(
         ConfigError: a mounting pitch is given for more than one board.
     """
     return solve(BoardMeasurements(points, covariance, board_points, valid), config).summary()
+
+
+def _what_edges_did(before: Solution, after: Solution) -> tuple[str, ...]:
+    """The sentence on what the edges made of the sigma of n; nothing where no edges were found."""
+    if after.edges is None:
+        return ()
+    sigmas = (solution.posterior.factor[-3:].square().sum(-1).sqrt().tolist() for solution in (before, after))
+    words = (", ".join(f"{value:.1e}" for value in sigma) for sigma in sigmas)
+    return (f"the edges of the squares, on every line, bring the sigmas of n from {next(words)} to {next(words)}",)
 
 
 def _line_motions(

@@ -18,7 +18,7 @@ from lsvision.image.stereo.refine import RefineOptions, refine_disparity
 from lsvision.image.stereo.relation import PairRelation, measure_relation
 from lsvision.image.stereo.residuals import Misfit
 from lsvision.image.stereo.sgbm import GrayPair, Search, match_sgbm
-from lsvision.image.stereo.steps import other_side_variance
+from lsvision.image.stereo.steps import step_evidence
 from lsvision.image.tiling import HaloRange
 from lsvision.stages.disparity.config import COARSE_TO_FINE_PX, DisparityConfig
 from lsvision.types import LineImage, Rig, StereoPair, TensorImage
@@ -165,7 +165,8 @@ def _measure(
     if disparity is not searched:
         factor = factor * holes_factor(searched, disparity, options.window_blocks(block))
     lowest_px = float(disparity_range(rig, config)[0])
-    variance = other_side_variance(left, right, own, misfit.noise_variance, lowest_px)
+    steps = step_evidence(left, right, own, misfit.noise_variance, lowest_px)
+    own, variance = own.masked_fill(steps.refuted, torch.nan), steps.variance
     if light_variance is not None:
         variance.add_(light_variance)
     sigma = variance.addcmul_(factor, refined.sigma.square()).sqrt_().add_(own - own)  # NaN where the disparity is

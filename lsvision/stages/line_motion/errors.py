@@ -1,16 +1,17 @@
 """How large the errors of registered lines are, and over how many lines they last: from what the registration leaves.
 
-The residuals e = r / σ of a line on its columns u are errors of the matching, less what the three displacements took
-of them. Matching errs alike over neighbouring columns and lines: with s_u the rms of a column and κ(l) the correlation
-of columns l apart, R = s_u s_u' κ(u - u') is the covariance of the errors, and with the rows a of J / σ
+A line's registration sets the sum of a_u ψ_u over its columns u to zero, with a the rows of J / σ and ψ the weighted
+residuals r / σ. These are errors of the matching, less what the three displacements took of them. Matching errs alike
+over neighbouring columns and lines: with s_u the rms of ψ on a column and κ(l) the correlation of columns l apart,
+R = s_u s_u' κ(u - u') is the covariance of ψ at the true displacement, and with d the mean derivative of ψ by r / σ
 
-    displacements = G e,   G = (aᵀ a)⁻¹ aᵀ,        cov = G R Gᵀ,        cov of the residuals = (1 - a G) R (1 - a G)ᵀ.
+    displacements = G ψ,   G = (aᵀ d a)⁻¹ aᵀ,    cov = G R Gᵀ,    cov of the residuals = (1 - d a G) R (1 - d a G)ᵀ.
 
 The last equation says how much the fit took; κ and s are raised until the residuals are as expected. How long errors
 last shows in sums over pieces of neighbouring columns, as those carry what moves a line. What a matching error has in
 common all over a line does not show in residuals and is stated beforehand.
 
-Source: Newey & West 1987 (covariance of correlated errors); Bell & McCaffrey 2002 (what the fit takes of residuals).
+Source: Huber 1981, ch. 7 (M-estimates); Newey & West 1987 (correlated errors); Bell & McCaffrey 2002 (residuals).
 """
 
 from collections.abc import Sequence
@@ -20,7 +21,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from lsvision.stages.line_motion.register import Equations
+from lsvision.stages.line_motion.register import LOOSE_SIGMA, Equations
 
 _LAGS = 100
 _FORGOTTEN = 0.1  # correlation of lines below which the sum over the lags ends
@@ -29,35 +30,42 @@ _USUAL_MEMORY, _LEAST_MEMORY = 8.0, 0.3  # lines
 _LEAST_LINES = 64  # needed to estimate the memory
 _PIECE = 16  # columns in use that are summed for the memory
 _ROUNDS = 5  # of raising the correlations by what the fit took
-_LEAST_SCALE = 0.1
+_LEAST_SCALE, _LEAST_SLOPE = 0.1, 0.1
 _COMMON = 0.5  # of the lines: a column counts that takes part on so many
 
 
 @dataclass(frozen=True)
 class ErrorSums:
-    """Sums over lines of products of residuals e: of pairs of columns, and of pieces of columns some lines apart.
+    """Sums over lines of products of ψ: of pairs of columns, and of pieces of columns some lines apart.
 
-    ``sensitivity`` sums a = J / σ. The numbers of terms stand beside the sums.
+    ``sensitivity`` sums a, ``weight`` and ``slope`` the weights of residuals and the derivatives of ψ, by column. The
+    numbers of terms stand beside the sums.
     """
 
     products: Float[Tensor, "columns columns"]
     pairs: Float[Tensor, "columns columns"]
     sensitivity: Float[Tensor, "columns 3"]
+    weight: Float[Tensor, " columns"]
+    slope: Float[Tensor, " columns"]
     lasting: Float[Tensor, "lags pieces"]
     lasting_pairs: Float[Tensor, "lags pieces"]
 
     @classmethod
     def of(cls, equations: Equations, cut_sigma: float) -> "ErrorSums":
-        """Those of neighbouring lines; samples beyond ``cut_sigma`` do not count."""
+        """Those of neighbouring lines; samples count as in the registration, not at all beyond ``cut_sigma``."""
         e = equations.residual / equations.sigma
         used = e.abs() < cut_sigma
-        e, seen = e.masked_fill(~used, 0.0), used.to(e)
+        seen, share = used.to(e), (e / cut_sigma).square().masked_fill(~used, 1.0)
+        weight, slope = (1 - share).square(), (1 - share) * (1 - 5 * share)  # of Tukey's ψ
+        psi = e.masked_fill(~used, 0.0) * weight
         by_motion = [(by / equations.sigma).masked_fill(~used, 0.0).sum(0) for by in equations.by_motion]
         return cls(
-            e.T @ e,
+            psi.T @ psi,
             seen.T @ seen,
             torch.stack(by_motion, -1),
-            _lagged(_in_pieces(e)),
+            weight.sum(0),
+            slope.sum(0),
+            _lagged(_in_pieces(psi)),
             _lagged(_in_pieces(seen) / _PIECE),
         )
 
@@ -88,15 +96,20 @@ class LineErrors:
         """
         count = sums.pairs.diagonal()
         there = count > _COMMON * count.max()
-        a = (sums.sensitivity / count.clamp(min=1)[:, None])[there]
-        stated = torch.linalg.inv(a.T @ a)
-        G = stated @ a.T
-        R = _covariance(sums.products[there][:, there], sums.pairs[there][:, there], a @ G)
-        variance = (G @ R @ G.T).diagonal().maximum(_LEAST_SCALE**2 * stated.diagonal())
+        per_line = (count[there, None]).clamp(min=1)
+        a, weight = sums.sensitivity[there] / per_line, sums.weight[there, None] / per_line
+        slope = (sums.slope[there, None] / per_line).clamp(min=_LEAST_SLOPE)
+        loose = torch.diag(a.new_tensor(LOOSE_SIGMA) ** -2)  # of what nothing shows
+        stated = torch.linalg.inv(a.T @ (weight * a) + loose)
+        known = torch.linalg.inv(a.T @ (slope * a) + loose)
+        G = known @ a.T
+        R = _covariance(sums.products[there][:, there], sums.pairs[there][:, there], slope * a @ G)
+        covariance = G @ R @ G.T + known @ loose @ known
+        variance = covariance.diagonal().maximum(_LEAST_SCALE**2 * stated.diagonal())
         variance = variance + variance.new_tensor([0.0, common_mm**2, 0.0])
-        weight = torch.zeros_like(sums.sensitivity)
-        weight[there] = (G.square() * R.diagonal()).T
-        return cls((variance / stated.diagonal()).sqrt(), _memory(sums, _in_pieces(weight.T).T), variance.sqrt())
+        share = torch.zeros_like(sums.sensitivity)
+        share[there] = (G.square() * R.diagonal()).T
+        return cls((variance / stated.diagonal()).sqrt(), _memory(sums, _in_pieces(share.T).T), variance.sqrt())
 
 
 def _covariance(products: Tensor, pairs: Tensor, taken: Tensor) -> Float[Tensor, "columns columns"]:

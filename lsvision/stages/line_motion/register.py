@@ -21,7 +21,7 @@ from lsvision.stages.line_motion.config import LineMotionConfig
 from lsvision.stages.line_motion.profiles import LineSamples, Reference
 
 # Standard deviations of displacements that no data restrict: mm, mm, rad. They keep the equations solvable.
-_LOOSE = (10.0, 10.0, 0.1)
+LOOSE_SIGMA = (10.0, 10.0, 0.1)
 _COARSE_MM = (4.0, 1.0)  # distances beyond which samples do not count in the first steps
 _LEAST_SIGMA_MM = 1e-3  # of a residual
 _PIECE_PX = 32  # columns that fall to one half, then to the other: matching errs alike over some 20
@@ -112,7 +112,7 @@ def register(
 
 def _loose(values: Tensor) -> Tensor:
     """Information that lets every displacement go."""
-    return torch.diag(values.new_tensor(_LOOSE) ** -2)
+    return torch.diag(values.new_tensor(LOOSE_SIGMA) ** -2)
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,7 @@ from lsvision.stages.calibration.along_scan.kernels import FINE, covariance_of, 
 from lsvision.stages.calibration.along_scan.lines import Travel, directions, latents
 from lsvision.stages.calibration.calibrate import calibrate
 from lsvision.stages.calibration.config import CalibrationConfig
+from lsvision.stages.calibration.known_motion import calibrate_lines
 from lsvision.stages.calibration.methods import joint
 from lsvision.types import BoardCorners
 from tests.stages.calibration.boards import FOUR_TILTS, RIG, SIGMA, Corners, simulate
@@ -175,3 +176,13 @@ def test_line_motion_is_reported_where_it_is_asked_for():
     paper = calibrate(boards[:1], RIG, CalibrationConfig(method="two_step"))
     assert paper.line_motions == ()
     assert paper.rmse_after_mm > 0.1
+
+
+def test_lines_of_a_board_whose_motion_is_known():
+    corners, boards, truth = shaken_boards(5, tilts=FOUR_TILTS[1:2])
+    found = calibrate_lines(boards[0], None, corners.n, RIG, CalibrationConfig())
+    assert found.rmse_after_mm < 0.01 < 0.1 < found.rmse_before_mm
+    torch.testing.assert_close(found.motion.n, torch.tensor([0.0, 1.0, 0.0]).double(), atol=1e-6, rtol=0)
+    level = without_trend(boards[0].travel_mm)
+    off = level(found.line_motions[0].values.T[:2]) - level(truth[0].T[:2])
+    assert float(off.square().mean().sqrt()) < 0.05

@@ -9,6 +9,9 @@ multiplied, again and again, by how much its process shows over how much it shou
 P the precision of the data at the knots with poses and n projected out, α what it makes of the data, the sums over all
 boards. No step lowers the likelihood, and none leaves the range. It needs no start: all begin alike.
 
+A variance that follows from few squares, of a wave that each board shows once, may well be larger: v_k Σ tr(K_k P) is
+their number ν, and ν / (ν - 2) the mean of what is probable over what is most probable.
+
 Source: Zhou, Hu, Zhou & Lange 2019, MM algorithms for variance components models; Patterson & Thompson 1971.
 """
 
@@ -28,6 +31,7 @@ from lsvision.stages.calibration.problem import BoardProblem
 _STEPS, _STEPS_NEARBY = 60, 30
 _STIRRED = 1e-3  # of what the residuals show, to begin with: a kernel without any would stay without
 _CAREFUL = 20  # steps with the root; later ones go twice as far
+_FEWEST_SQUARES = 4.0  # that a variance counts as known by
 _NOTHING = 1e-12  # of a component's variance
 
 
@@ -50,6 +54,8 @@ def search_with_edges(
         expected = torch.einsum("kij,bcij->ck", correlation, data.precision)
         ratio = (shown / expected).clamp(0.0, 1e3)
         variances = variances * (ratio.sqrt() if step < _CAREFUL else ratio)
+    squares = (variances * expected).clamp(min=_FEWEST_SQUARES)
+    variances = variances * squares / (squares - 2.0)
     variances = torch.where(variances > _NOTHING * variances.amax(), variances, 0.0)
     evidence, log_ratio = evidence_by_component(equations, covariance_of(variances, FINE)[None])
     return FoundErrors(variances, log_ratio, variances.sum(-1).sqrt(), float(evidence))
