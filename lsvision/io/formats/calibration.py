@@ -235,10 +235,8 @@ def motion_to_dict(motion: Motion) -> dict[str, object]:
 
 def _board_to_dict(board: BoardFit) -> dict[str, object]:
     rest = {key: value for key, value in asdict(board).items() if key != "pose"}
-    pose = {
-        "rotation": board.pose.rotation.double().tolist(),
-        "translation_mm": board.pose.translation.double().tolist(),
-    }
+    rotation, translation = board.pose.rotation.double().tolist(), board.pose.translation.double().tolist()
+    pose = {"rotation": rotation, "translation_mm": translation}
     return {"scan": board.scan, "corners": board.corners, **pose, **rest}
 
 
