@@ -197,7 +197,7 @@ def default_values(schema: type) -> dict[str, Any]:
         shape = shape_of(annotations_of(schema)[item.name])
         if not is_required(item):
             default: Any = item.default if item.default_factory is MISSING else item.default_factory()
-            values[item.name] = asdict(default) if shape.is_dataclass else default
+            values[item.name] = asdict(default) if shape.is_dataclass and default is not None else default
         else:
             values[item.name] = default_values(shape.kind) if shape.is_dataclass else REQUIRED
     return values

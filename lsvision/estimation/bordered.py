@@ -48,7 +48,7 @@ def bordered_least_squares(
     start: BorderedState,
     *,
     max_iterations: int = 30,
-    tolerance: float = 1e-4,
+    tolerance: float = 0.01,
 ) -> BorderedFit:
     """Minimise ‖residual‖² + ‖shared‖² for a batch of independent problems.
 

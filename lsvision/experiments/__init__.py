@@ -39,11 +39,13 @@ EXPERIMENTS = {
     "paper": Experiment("paper", "run_paper", "PaperSettings"),
     "simulate": Experiment("simulate", "run_simulate", "SimulateSettings"),
     "calibrate": Experiment("calibrate", "run_calibrate", "CalibrateSettings"),
+    "rig": Experiment("rig", "run_rig", "RigSettings"),
     "correct": Experiment("correct", "run_correct", "CorrectSettings"),
     "motion": Experiment("motion", "run_motion", "MotionSettings"),
     "reprocess": Experiment("reprocess", "run_reprocess", "ReprocessSettings"),
     "status": Experiment("reprocess", "run_status", "StatusSettings"),
     "validate": Experiment("validate", "run_validate", "ValidateSettings"),
     "study": Experiment("study", "run_study", "StudySettings"),
+    "study_rig": Experiment("study_rig", "run_study_rig", "StudyRigSettings"),
     "collect": Experiment("sweep", "run_collect", "CollectSettings"),
 }

@@ -17,7 +17,7 @@ from torch import Tensor
 from lsvision.types import RawCamera, RawRig, ViewPlane
 
 _OPTICS = 5  # quantities of a camera
-_INVERSIONS = 6  # Newton steps of the distortion's inverse: from 0.1 of distortion on, rounding is left
+_INVERSIONS = 5  # Newton steps of the distortion's inverse: from 0.1 of distortion on, rounding is left
 
 
 def quantities_of(rig: RawRig) -> Float[Tensor, " quantities"]:
@@ -61,11 +61,11 @@ class LineCamera:
     def slope(self, column: Float[Tensor, "*columns"]) -> Float[Tensor, "*columns"]:
         """Slope dx/dz of the ray of a column, px."""
         t = (column - self.principal_px) / self.focal_px
-        return torch.tan(torch.atan(self._distorted(t)) + self.turn)
+        return _turned(self._distorted(t), torch.tan(self.turn))
 
     def column(self, slope: Float[Tensor, "*columns"]) -> Float[Tensor, "*columns"]:
         """Column, px, that looks along a slope dx/dz: the inverse of ``slope``, by Newton's method."""
-        distorted = torch.tan(torch.atan(slope) - self.turn)
+        distorted = _turned(slope, -torch.tan(self.turn))
         t = distorted
         for _ in range(_INVERSIONS):
             square = t.square()
@@ -76,6 +76,11 @@ class LineCamera:
     def _distorted(self, t: Tensor) -> Tensor:
         square = t.square()
         return t * (1 + square * (self.k1 + self.k2 * square))
+
+
+def _turned(slope: Tensor, tangent: Tensor) -> Tensor:
+    """Tangent of the sum of two angles from their tangents."""
+    return (slope + tangent) / (1 - slope * tangent)
 
 
 @dataclass(frozen=True)
@@ -131,6 +136,16 @@ class RawPair:
         """Y, mm, of the plane that the right camera looks at."""
         s0, s1, s2 = self.plane.unbind(-1)
         return s0 + s1 * (x - self.baseline_mm / 2) + s2 * (z - self.z0_mm)
+
+    def field_mm(self, width_px: int) -> Float[Tensor, "*batch"]:
+        """What the left camera sees at z0 with lines of a width, mm."""
+        first, last = (self.left.slope(torch.full_like(self.z0_mm, column)) for column in (0.0, width_px - 1.0))
+        return (last - first) * self.z0_mm
+
+    @property
+    def middle(self) -> Float[Tensor, "*batch 3"]:
+        """The point (B/2, 0, z0), mm, midway between the cameras."""
+        return torch.stack([self.baseline_mm / 2, torch.zeros_like(self.z0_mm), self.z0_mm], dim=-1)
 
     def seen_left(self, points: Float[Tensor, "*#batch 3"], n: Float[Tensor, "*#batch 3"]) -> Seen:
         """Where the left camera sees points P, mm, of an object with the motion n."""

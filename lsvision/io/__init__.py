@@ -5,8 +5,16 @@ from lsvision.io.formats.calibration import check_rig_match, read_calibration, w
 from lsvision.io.formats.checksum import scan_sha256
 from lsvision.io.formats.encoder import read_encoder, write_encoder
 from lsvision.io.formats.line_motion import read_line_motion, write_line_motion
-from lsvision.io.formats.raw_rig import RigPair, raw_rig_to_dict, read_rig_pair, write_raw_rig
+from lsvision.io.formats.raw_rig import (
+    RigPair,
+    raw_rig_from_dict,
+    raw_rig_to_dict,
+    read_raw_rig,
+    read_rig_pair,
+    write_raw_rig,
+)
 from lsvision.io.formats.rig import read_rig, rig_from_dict, rig_to_dict, write_rig
+from lsvision.io.formats.rig_calibration import write_rig_calibration
 from lsvision.io.formats.scan import NewScan, read_scan, scan_files, write_scan
 from lsvision.io.images.line_image import open_line_image
 from lsvision.io.images.tiff import write_line_image
@@ -39,11 +47,13 @@ __all__ = [
     "naming_full_disk",
     "open_line_image",
     "product_writer",
+    "raw_rig_from_dict",
     "raw_rig_to_dict",
     "read_calibration",
     "read_encoder",
     "read_line_motion",
     "read_product",
+    "read_raw_rig",
     "read_rig",
     "read_rig_pair",
     "read_scan",
@@ -61,6 +71,7 @@ __all__ = [
     "write_ply",
     "write_raw_rig",
     "write_rig",
+    "write_rig_calibration",
     "write_scan",
     "write_text",
 ]

@@ -7,6 +7,7 @@ frame C, product frame M.
 
 from lsvision.types.calibration import (
     BoardCorners,
+    BoardEdges,
     BoardFit,
     Calibration,
     CalibrationMethod,
@@ -19,6 +20,7 @@ from lsvision.types.calibration import (
     Provenance,
     RefusedVerdict,
     Verdict,
+    WhetherLineMotion,
 )
 from lsvision.types.line_motion import LINE_COMPONENTS, LineComponent, LineFinding, LineMotion
 from lsvision.types.product import (
@@ -49,6 +51,7 @@ __all__ = [
     "RIG_QUANTITIES",
     "Board",
     "BoardCorners",
+    "BoardEdges",
     "BoardFit",
     "Calibration",
     "CalibrationMethod",
@@ -86,5 +89,6 @@ __all__ = [
     "Travel",
     "Verdict",
     "ViewPlane",
+    "WhetherLineMotion",
     "missing_ranges",
 ]

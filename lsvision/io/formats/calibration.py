@@ -19,6 +19,7 @@ from lsvision.types import (
     CalibrationMethod,
     ErrorAlongScan,
     Iteration,
+    LineFinding,
     Motion,
     Observability,
     ObservedDirection,
@@ -75,6 +76,8 @@ class BoardEntries(Checked):
     reduced_chi_square: NonNegative | None = None
     outliers: tuple[tuple[int, int], ...] = ()
     largest_residual: NonNegative | None = None
+    line_motion: tuple[LineFinding, ...] = ()
+    line_motion_file: str | None = None
 
     def fit(self) -> BoardFit:
         """The board's fit."""
@@ -151,7 +154,7 @@ def write_calibration(calibration: Calibration, path: Path | str) -> None:
         "converged": calibration.converged,
         "noise_scale": calibration.noise_scale,
         "errors_along_scan": [asdict(item) for item in calibration.errors_along_scan],
-        "motion": _motion_to_dict(calibration.motion),
+        "motion": motion_to_dict(calibration.motion),
         "rmse_before_mm": calibration.rmse_before_mm,
         "rmse_after_mm": calibration.rmse_after_mm,
         "improvement": calibration.improvement,
@@ -218,7 +221,8 @@ def check_rig_match(calibration: Calibration, scan: Scan) -> None:
             )
 
 
-def _motion_to_dict(motion: Motion) -> dict[str, object]:
+def motion_to_dict(motion: Motion) -> dict[str, object]:
+    """What a file says of a motion: n, what follows from it, and its covariance."""
     n1, n2, n3 = n = motion.n.double().tolist()
     return {
         "n": n,
@@ -230,11 +234,9 @@ def _motion_to_dict(motion: Motion) -> dict[str, object]:
 
 
 def _board_to_dict(board: BoardFit) -> dict[str, object]:
-    rest = {item.name: getattr(board, item.name) for item in fields(board) if item.name != "pose"}
-    pose = {
-        "rotation": board.pose.rotation.double().tolist(),
-        "translation_mm": board.pose.translation.double().tolist(),
-    }
+    rest = {key: value for key, value in asdict(board).items() if key != "pose"}
+    rotation, translation = board.pose.rotation.double().tolist(), board.pose.translation.double().tolist()
+    pose = {"rotation": rotation, "translation_mm": translation}
     return {"scan": board.scan, "corners": board.corners, **pose, **rest}
 
 

@@ -109,6 +109,7 @@ def measure_corners(
         board_points=board.corner_points(),
         left_px=measured.left_px,
         right_px=measured.right_px,
+        travel_mm=travel_at(scan.travel, torch.arange(scan.lines, dtype=torch.float64)),
     )
 
 

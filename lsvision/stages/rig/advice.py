@@ -61,7 +61,7 @@ def next_scan(solution: RigSolution, shape: HeightShape, depth_range_mm: float) 
     poses = _candidates(solution, depth_range_mm)
     precision = torch.linalg.inv(solution.whitened_covariance) + _information(solution, poses) / solution.noise_scale**2
     factor = torch.linalg.cholesky(torch.linalg.inv(precision))
-    bends = (shape.by_shared @ factor).square().sum(-1).mean(-1).sqrt()
+    bends = shape.stated_mm(factor)
     best = int(bends.argmin())
     turned, about_x, about_y, sideways, deeper = poses[best].tolist()
     return Proposal(bool(turned), about_x, about_y, sideways, deeper, 1e3 * float(bends[best]))
@@ -75,7 +75,8 @@ def _candidates(solution: RigSolution, depth_range_mm: float) -> Float[Tensor, "
     """All poses of ``Proposal``, mm and rad."""
     body, sides = solution.model.body_points[0], []
     longer, shorter = (body.amax(0) - body.amin(0))[:2].tolist()
-    half_field = _half_field_mm(solution.model)
+    rig = solution.model.prior.rig
+    half_field = float(RawPair.of(rig).field_mm(rig.width_px)) / 2
     steps = torch.tensor([-1.0, 0.0, 1.0], dtype=torch.float64)
     for turned in (0.0, 1.0):
         across, along = (shorter, longer) if turned else (longer, shorter)
@@ -88,21 +89,14 @@ def _candidates(solution: RigSolution, depth_range_mm: float) -> Float[Tensor, "
     return torch.cat(sides)
 
 
-def _half_field_mm(model: RigModel) -> float:
-    rig = model.prior.rig
-    pair = RawPair.of(rig)
-    edges = pair.left.slope(torch.tensor([0.0, rig.width_px - 1.0], dtype=torch.float64)) * pair.z0_mm
-    return float(edges.diff()) / 2
-
-
 def _information(solution: RigSolution, poses: Float[Tensor, "poses 5"]) -> Float[Tensor, "poses shared shared"]:
     """Information on what all boards share of one more scan of the first board in given poses."""
     model, count = solution.model, len(poses)
     turned, about_x, about_y, sideways, deeper = poses.unbind(-1)
-    zero, pair = torch.zeros_like(turned), RawPair.of(model.prior.rig)
+    zero = torch.zeros_like(turned)
     axes = (about_x, zero, zero), (zero, about_y, zero), (zero, zero, turned * math.pi / 2)
     about_x, about_y, in_plane = (rotation_from_vector(torch.stack(axis, dim=-1)) for axis in axes)
-    middle = torch.stack([pair.baseline_mm / 2 + sideways, zero, pair.z0_mm + deeper], dim=-1)
+    middle = RawPair.of(model.prior.rig).middle + torch.stack([sideways, zero, deeper], dim=-1)
     start = Pose((about_x @ about_y @ in_plane)[:, None], middle[:, None])
     simulated = RigModel(model.prior, start, zero[:, None], model.body_points[:1].expand(count, 1, -1, -1))
     first = solution.sightings.chosen([0])

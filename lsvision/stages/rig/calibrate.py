@@ -6,11 +6,11 @@ from dataclasses import replace
 import torch
 
 from lsvision.errors import CalibrationError
-from lsvision.geometry import RawPair, rotation_from_vector, with_quantities
+from lsvision.geometry import RawPair, ideal_rig, rotation_from_vector, sharp_depth_mm, with_quantities
 from lsvision.stages.rig.advice import next_scan
 from lsvision.stages.rig.config import RigConfig
 from lsvision.stages.rig.height_shape import HeightShape
-from lsvision.stages.rig.held_out import held_out_rms
+from lsvision.stages.rig.held_out import FEWEST_BOARDS, HeldOut
 from lsvision.stages.rig.model import QUANTITIES, RigPrior
 from lsvision.stages.rig.observability import unobserved
 from lsvision.stages.rig.sightings import CameraSighting, Sightings
@@ -44,57 +44,70 @@ def calibrate_rig(sightings: Sightings, scans: Sequence[str], rig: RawRig, confi
     shared = solution.shared
     if not bool(shared.vector.isfinite().all() & solution.found.factor.isfinite().all()):
         raise CalibrationError(f"{', '.join(scans)}: the corners do not determine the boards' poses")
-    shape = HeightShape.of(rig, shared, prior.sigma, config.depth_range_mm)
+    depth_range_mm = config.depth_range_mm or sharp_depth_mm(ideal_rig(rig))
+    shape = HeightShape.of(rig, shared, prior.sigma, depth_range_mm)
     weak = unobserved(solution.whitened_covariance, shape, config.observed_share)
-    advice = next_scan(solution, shape, config.depth_range_mm).in_words
-    verdict, reasons = _verdict(solution, weak, config), _reasons(solution, weak, advice, config)
+    advice = next_scan(solution, shape, depth_range_mm).in_words
+    enough = config.held_out and solution.sightings.boards >= FEWEST_BOARDS
+    held_out = HeldOut.of(solution, config) if enough else None
+    reasons = [*_faults(solution), *_contradicting(solution, scans, held_out)]
+    bending = [combination for combination in weak if combination.bend_um >= config.least_height_um]
+    if bending and not reasons:
+        reasons = [*_left_to_the_data_sheet(bending), advice]
     sigma = solution.covariance.diagonal().sqrt().tolist()
     found = with_quantities(rig, shared.quantities)
     return RigCalibration(
         rig=replace(found, sigma=tuple(zip(RIG_QUANTITIES, sigma[:QUANTITIES], strict=True))),
         motion=Motion(shared.n, solution.covariance[QUANTITIES:, QUANTITIES:]),
         covariance=solution.covariance,
-        boards=_boards(solution, scans, held_out_rms(solution, config)),
+        boards=_boards(solution, scans, held_out),
         residuals=_residuals(solution),
         noise_scale=float(solution.noise_scale),
-        height_error_um=1e3 * shape.rms_mm(solution.found.factor),
+        height_error_um=1e3 * float(shape.stated_mm(solution.found.factor)),
         unobserved=weak,
         advice=advice,
-        verdict=verdict,
-        reasons=reasons,
+        verdict=_verdict(solution, bool(bending)),
+        reasons=tuple(reasons),
     )
 
 
-def _verdict(solution: RigSolution, weak: Sequence[RigCombination], config: RigConfig) -> RigVerdict:
+def _verdict(solution: RigSolution, bending: bool) -> RigVerdict:
     if not bool(solution.found.converged):
         return "not converged"
     if float(solution.noise_scale) > _LARGEST_NOISE:
         return "inconsistent"
-    return "prior-dominated" if _bending(weak, config) else "determined"
+    return "prior-dominated" if bending else "determined"
 
 
-def _reasons(solution: RigSolution, weak: Sequence[RigCombination], advice: str, config: RigConfig) -> tuple[str, ...]:
-    """Why the verdict is not ``determined``, in sentences."""
-    reasons = []
+def _faults(solution: RigSolution) -> list[str]:
+    """Why no rig came out, in sentences."""
+    faults = []
     if not bool(solution.found.converged):
-        reasons.append(f"the estimate had not settled after {int(solution.found.iterations)} iterations")
+        faults.append(f"the estimate had not settled after {int(solution.found.iterations)} iterations")
     if float(solution.noise_scale) > _LARGEST_NOISE:
-        reasons.append(
+        faults.append(
             f"the corners are off by {float(solution.noise_scale):.1f} times their stated sigmas: the object shook, "
             "its speed changed from scan to scan, or the board or the rig's file is not as stated"
         )
-    bending = _bending(weak, config)
-    if bending and not reasons:
-        named = "; ".join(f"{item.in_words} (bends heights by {item.bend_um:.2g} um)" for item in bending)
-        reasons += [f"the data sheet says more than the scans of {named}", advice]
-    return tuple(reasons)
+    return faults
 
 
-def _bending(weak: Sequence[RigCombination], config: RigConfig) -> list[RigCombination]:
-    return [combination for combination in weak if combination.bend_um >= config.least_height_um]
+def _contradicting(solution: RigSolution, scans: Sequence[str], held_out: HeldOut | None) -> list[str]:
+    """The scan without which the others agree, where one contradicts them."""
+    if held_out is None or float(solution.noise_scale) <= _LARGEST_NOISE:
+        return []
+    least = int(held_out.rms_of_others.argmin())
+    if float(held_out.rms_of_others[least]) > _LARGEST_NOISE:
+        return []
+    return [f"without {scans[least]} the others agree to {float(held_out.rms_of_others[least]):.1f} sigmas"]
 
 
-def _boards(solution: RigSolution, scans: Sequence[str], held_out: Sequence[float | None]) -> tuple[RigBoard, ...]:
+def _left_to_the_data_sheet(bending: Sequence[RigCombination]) -> list[str]:
+    named = "; ".join(f"{item.in_words} (bends heights by {item.bend_um:.2g} um)" for item in bending)
+    return [f"the data sheet says more than the scans of {named}"]
+
+
+def _boards(solution: RigSolution, scans: Sequence[str], held_out: HeldOut | None) -> tuple[RigBoard, ...]:
     model, valid = solution.model, solution.sightings.valid
     own, n = solution.found.state.own, solution.shared.n
     rotation = rotation_from_vector(own[:, :3]) @ model.start.rotation
@@ -109,7 +122,7 @@ def _boards(solution: RigSolution, scans: Sequence[str], held_out: Sequence[floa
             outliers=int(solution.outliers[i]),
             pose=Pose(rotation[i], origin[i]),
             rms=float(rms[i]),
-            held_out_rms=held_out[i],
+            held_out_rms=None if held_out is None else float(held_out.rms[i]),
         )
         for i, name in enumerate(scans)
     )

@@ -28,7 +28,7 @@ class RigConfig(Checked):
     motion_sigma: Positive = 0.05
     outlier_sigma: Positive = 5.0
     max_iterations: PositiveInt = 30
-    tolerance: Positive = 1e-4  # length of the last step, in sigmas
+    tolerance: Positive = 0.01  # length of the last step, in sigmas; forward derivatives are good to about 1e-4 of them
     observed_share: Positive = 0.5
     least_height_um: NonNegative = 1.0
     depth_range_mm: Positive = (

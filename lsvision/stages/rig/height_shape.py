@@ -16,14 +16,14 @@ from lsvision.stages.rig.model import QUANTITIES, Shared
 from lsvision.types import RawRig
 
 _COLUMNS, _DEPTHS = 33, 3
-_FIELD_SHARE = 0.96  # of the columns that both cameras share at z0
+_FIELD_SHARE = 0.96  # of the left camera's line
 
 
 @dataclass(frozen=True)
 class HeightShape:
     """The derivative of height, mm, by what all boards share, over columns and depths of the field, without its tilt.
 
-    Unknowns are in sigmas of their prior.
+    Unknowns, and their errors, are in sigmas of the prior.
     """
 
     by_shared: Float[Tensor, "points shared"]
@@ -44,18 +44,17 @@ class HeightShape:
         tilt = torch.stack([torch.ones_like(across), across], dim=-1)
         return cls(by_shared - tilt @ torch.linalg.lstsq(tilt, by_shared).solution)
 
-    def rms_mm(self, factor: Float[Tensor, "shared columns"]) -> float:
+    def stated_mm(self, factor: Float[Tensor, "*batch shared columns"]) -> Float[Tensor, "*batch"]:
         """Rms bend that errors of a covariance ``factor @ factor.mT`` make, mm."""
-        return float((self.by_shared @ factor).square().sum(-1).mean().sqrt())
+        return (self.by_shared @ factor).square().sum(-1).mean(-1).sqrt()
 
-
-def bend_mm(shape: HeightShape, error: Float[Tensor, "*batch shared"]) -> Float[Tensor, "*batch"]:
-    """Rms bend that given errors make, mm; they are in sigmas of the prior."""
-    return (error @ shape.by_shared.mT).square().mean(-1).sqrt()
+    def bend_mm(self, error: Float[Tensor, "*batch shared"]) -> Float[Tensor, "*batch"]:
+        """Rms bend that given errors make, mm."""
+        return (error @ self.by_shared.mT).square().mean(-1).sqrt()
 
 
 def _field(rig: RawRig, pair: RawPair, depth_range_mm: float) -> Float[Tensor, "points 3"]:
-    """Points of the scan plane, mm, in the middle of what both cameras see."""
+    """Points of the scan plane, mm, all over the field at z0 and over the depth."""
     middle, half = (rig.width_px - 1) / 2, _FIELD_SHARE * (rig.width_px - 1) / 2
     share = torch.linspace(-1, 1, _COLUMNS, dtype=torch.float64)
     z0 = pair.crossing_mm(middle)

@@ -23,7 +23,7 @@ def unobserved(
     """
     found = principal_directions(covariance, 1.0)
     return tuple(
-        RigCombination(_parts(vector.tolist()), float(share), 1e3 * shape.rms_mm(share * vector[:, None]))
+        RigCombination(_parts(vector.tolist()), float(share), 1e3 * float(shape.bend_mm(share * vector)))
         for vector, share in zip(found.vectors, found.share, strict=True)
         if float(share) > observed_share
     )

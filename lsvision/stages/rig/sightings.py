@@ -7,13 +7,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from lsvision.errors import BoardNotFoundError
 from lsvision.geometry import travel_at
-from lsvision.image.board.detect import detect_board
 from lsvision.image.board.refine import DetectedCorners
-from lsvision.types import Board, LineImage, Travel
-
-_FEWEST = 20  # corners of a board that both cameras must see
+from lsvision.types import Board, Travel
 
 
 @dataclass(frozen=True)
@@ -61,41 +57,18 @@ class Sightings:
         return Sightings(left, right, self.valid[..., index, :], self.board_points)
 
 
-@dataclass(frozen=True)
-class RawScan:
-    """The images of a raw pair of cameras, and the travel of their lines."""
-
-    name: str
-    left: LineImage
-    right: LineImage
-    travel: Travel
+def sighted(left: DetectedCorners, right: DetectedCorners, travel: Travel, board: Board) -> Sightings:
+    """What both cameras saw of one board in a scan with a travel."""
+    valid = left.valid & right.valid
+    eyes = [CameraSighting.of(corners, valid, travel) for corners in (left, right)]
+    alone = [CameraSighting(eye.position[None], eye.factor[None]) for eye in eyes]
+    return Sightings(alone[0], alone[1], valid[None], board.corner_points())
 
 
-def find_sightings(scan: RawScan, board: Board) -> Sightings:
-    """Find a board in both images of a scan; the result is of one board.
-
-    Raises:
-        BoardNotFoundError: an image without the board, or too few corners that both cameras see; names the scan.
-    """
-    mirrored, found = scan.travel.transport == "reverse", []
-    for side, image in (("left", scan.left), ("right", scan.right)):
-        corners = detect_board(image, board, mirrored=mirrored)
-        if corners is None:
-            size = f"{board.columns} x {board.rows}"
-            raise BoardNotFoundError(f"{scan.name}: no board of {size} squares in the {side} image")
-        found.append(corners)
-    valid = found[0].valid & found[1].valid
-    if int(valid.sum()) < _FEWEST:
-        raise BoardNotFoundError(f"{scan.name}: only {int(valid.sum())} corners in both images, {_FEWEST} are needed")
-    left, right = (CameraSighting.of(corners, valid, scan.travel) for corners in found)
-    return joined([Sightings(left, right, valid, board.corner_points())], new=True)
-
-
-def joined(parts: Sequence[Sightings], *, new: bool = False) -> Sightings:
-    """Sightings of boards one after the other; with ``new`` each part is that of a single board without an axis."""
-    put = torch.stack if new else torch.cat
+def joined(parts: Sequence[Sightings]) -> Sightings:
+    """Sightings of boards of one kind, one after the other."""
     left, right = (
-        CameraSighting(put([eye.position for eye in eyes]), put([eye.factor for eye in eyes]))
-        for eyes in zip(*((part.left, part.right) for part in parts), strict=True)
+        CameraSighting(torch.cat([eye.position for eye in eyes]), torch.cat([eye.factor for eye in eyes]))
+        for eyes in ([part.left for part in parts], [part.right for part in parts])
     )
-    return Sightings(left, right, put([part.valid for part in parts]), parts[0].board_points)
+    return Sightings(left, right, torch.cat([part.valid for part in parts]), parts[0].board_points)

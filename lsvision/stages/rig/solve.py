@@ -7,7 +7,7 @@ scatter more than their covariance says, it is scaled as they ask.
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from lsvision.estimation import BorderedFit, BorderedState, bordered_least_squares
@@ -16,7 +16,9 @@ from lsvision.stages.rig.model import POSE, SHARED, RigModel, RigPrior, Shared
 from lsvision.stages.rig.sightings import Sightings
 
 _NORMAL_MEDIAN = 3.3567  # median of a chi-square variable of four: a corner has a column and a travel in two images
-_ROUNDS = 10  # of leaving corners out
+_ROUNDS = 10
+_SOFT = 3.0  # scales at which a corner weighs a quarter
+_MOST = 0.7  # of a board's corners that must be left
 _SETTLED = 1.05  # ratio of two scales in a row
 
 
@@ -65,7 +67,7 @@ def solve_rig(sightings: Sightings, prior: RigPrior, config: RigConfig) -> RigSo
     chi_square = corner_residuals(model, kept, state).square().sum((-3, -2, -1))
     freedom = 4.0 * kept.valid.sum((-2, -1)) - POSE * sightings.boards
     scale = (chi_square / freedom.clamp(min=1)).sqrt().clamp(min=1.0)
-    found = fit_rig(model, kept, state, scale, config)
+    found = fit_rig(model, kept, state, _each(kept, scale.reciprocal()), config)
     return RigSolution(model, kept, sightings.valid.sum(-1) - kept.valid.sum(-1), found, scale)
 
 
@@ -84,32 +86,50 @@ def corner_residuals(
 def _without_outliers(
     model: RigModel, sightings: Sightings, state: BorderedState, config: RigConfig
 ) -> tuple[BorderedState, Sightings]:
-    """A state that fits the corners that are not far off, and those; their scale is that of the median corner."""
-    kept, scale = sightings, _median_scale(model, sightings, state)
+    """A state that fits most corners, each weighed by how far it is off, and the sightings without those far off.
+
+    The weights are Geman & McClure's, in units of the median corner's scale, as iteratively reweighted least squares.
+    """
+    off, scale = _distances(model, sightings, state)
+    weight = _each(sightings, scale.reciprocal())
     for _ in range(_ROUNDS):
-        state = fit_rig(model, kept, state, scale, config).state
-        before, scale = scale, _median_scale(model, kept, state)
-        off = corner_residuals(model, sightings, state).square().sum(-1).sqrt()
-        valid = sightings.valid & (off <= config.outlier_sigma * scale[..., None, None])
-        settled = bool((valid == kept.valid).all() & (before <= _SETTLED * scale).all())
-        kept = replace(kept, valid=valid)
-        if settled:
+        state = fit_rig(model, sightings, state, weight, config).state
+        before, (off, scale) = scale, _distances(model, sightings, state)
+        if bool((before <= _SETTLED * scale).all()):
             break
-    return state, kept
+        weight = _each(sightings, scale.reciprocal()) / (1 + (off / (_SOFT * scale[..., None, None])).square())
+    valid = _near(sightings, off <= config.outlier_sigma * scale[..., None, None])
+    return state, replace(sightings, valid=valid)
 
 
-def _median_scale(model: RigModel, sightings: Sightings, state: BorderedState) -> Float[Tensor, "*batch"]:
+def _near(sightings: Sightings, near: Bool[Tensor, "*batch boards corners"]) -> Bool[Tensor, "*batch boards corners"]:
+    """The valid corners that are near; of a board most of whose corners are not, all: outliers are no whole board."""
+    valid = sightings.valid & near
+    few = valid.sum(-1) < _MOST * sightings.valid.sum(-1)
+    return torch.where(few[..., None], sightings.valid, valid)
+
+
+def _distances(model: RigModel, sightings: Sightings, state: BorderedState) -> tuple[Tensor, Tensor]:
+    """How far each corner is off, in sigmas as stated, and how many of them the median corner takes for one, >= 1."""
     square = corner_residuals(model, sightings, state).square().sum(-1)
-    square = torch.where(sightings.valid, square, torch.nan).flatten(-2)
-    return (square.nanmedian(-1).values / _NORMAL_MEDIAN).sqrt().clamp(min=1.0)
+    median = torch.where(sightings.valid, square, torch.nan).flatten(-2).nanmedian(-1).values
+    return square.sqrt(), (median / _NORMAL_MEDIAN).sqrt().clamp(min=1.0)
+
+
+def _each(sightings: Sightings, of_problem: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch boards corners"]:
+    return of_problem[..., None, None].expand(sightings.valid.shape)
 
 
 def fit_rig(
-    model: RigModel, sightings: Sightings, start: BorderedState, scale: Float[Tensor, "*batch"], config: RigConfig
+    model: RigModel,
+    sightings: Sightings,
+    start: BorderedState,
+    weight: Float[Tensor, "*batch boards corners"],
+    config: RigConfig,
 ) -> BorderedFit:
-    """Estimate rig, motion and poses from corners as they stand, with a noise ``scale`` times their stated sigma."""
+    """Estimate rig, motion and poses from corners; ``weight`` is what each residual in sigmas is multiplied by."""
 
     def rows(state: BorderedState) -> Tensor:
-        return corner_residuals(model, sightings, state).flatten(-2) / scale[..., None, None]
+        return (corner_residuals(model, sightings, state) * weight[..., None]).flatten(-2)
 
     return bordered_least_squares(rows, start, max_iterations=config.max_iterations, tolerance=config.tolerance)

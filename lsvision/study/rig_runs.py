@@ -1,0 +1,106 @@
+"""Many calibrations of simulated raw rigs: errors against what is stated, point by point."""
+
+import itertools
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, fields, replace
+from typing import Any
+
+import polars
+import torch
+
+from lsvision.errors import ConfigError
+from lsvision.geometry import ideal_rig, sharp_depth_mm
+from lsvision.report.progress import progress_bars
+from lsvision.schema import OptionError
+from lsvision.stages.rig.config import RigConfig
+from lsvision.stages.rig.height_shape import HeightShape
+from lsvision.stages.rig.model import SHARED, RigPrior, Shared
+from lsvision.stages.rig.solve import RigSolution, solve_rig
+from lsvision.study.rig_scans import RigConditions, rig_scans
+from lsvision.types import Board
+
+_BATCH = 32  # runs at once: some 100 MB with sixteen boards
+
+
+@dataclass(frozen=True)
+class RigSampling:
+    """How many rigs are drawn for every point, and from which seed."""
+
+    runs: int
+    seed: int = 0
+
+
+def rig_points(base: RigConditions, axes: Mapping[str, Sequence[float | int] | None]) -> list[RigConditions]:
+    """The grid of all axes, the last one fastest; an axis of None stays at its value.
+
+    Raises:
+        ConfigError: an axis that is no condition, is empty, or holds a value that the condition cannot have.
+    """
+    known = [item.name for item in fields(RigConditions)]
+    varied = {name: values for name, values in axes.items() if values is not None}
+    for name, values in varied.items():
+        if name not in known:
+            raise ConfigError(f"axes.{name}: unknown; expected one of {', '.join(known)}")
+        if not values:
+            raise ConfigError(f"axes.{name}: the list is empty")
+    grid: list[dict[str, Any]] = [
+        dict(zip(varied, values, strict=True)) for values in itertools.product(*varied.values())
+    ]
+    try:
+        return [replace(base, **values) for values in grid]
+    except OptionError as error:
+        raise ConfigError(f"axes.{error.key}: {error.problem}") from error
+
+
+def run_rigs(
+    points: Sequence[RigConditions], prior: RigPrior, board: Board, config: RigConfig, sampling: RigSampling
+) -> polars.DataFrame:
+    """One row per point: its conditions, and the figures of merit over its runs.
+
+    ``height_error_um`` is the rms bend of heights over the runs, ``stated_um`` that which the calibrations state;
+    ``nees`` is the normalised error of all quantities and n, ``unknowns`` where the stated covariance is right;
+    ``largest_z`` the largest error of any quantity in any run, in sigmas.
+    """
+    start = prior.shared(torch.zeros_like(prior.sigma))
+    shape = HeightShape.of(prior.rig, start, prior.sigma, config.depth_range_mm or sharp_depth_mm(ideal_rig(prior.rig)))
+    rows = []
+    with progress_bars() as bars:
+        bar = bars.start("calibrate rigs", total=len(points) * sampling.runs)
+        for index, conditions in enumerate(points):
+            torch.manual_seed(sampling.seed * len(points) + index)
+            batches = []
+            for first in range(0, sampling.runs, _BATCH):
+                count = min(_BATCH, sampling.runs - first)
+                scans = rig_scans(prior, board, conditions, count)
+                batches.append(_figures(solve_rig(scans.sightings, prior, config), scans.truth, shape))
+                bars.advance(bar, count)
+            rows.append({**asdict(conditions), "runs": sampling.runs, **_merits(polars.concat(batches))})
+    return polars.DataFrame(rows, infer_schema_length=None)
+
+
+def _figures(solution: RigSolution, truth: Shared, shape: HeightShape) -> polars.DataFrame:
+    """One row per run."""
+    error, covariance = solution.shared.vector - truth.vector, solution.covariance
+    columns = {
+        "bend_um": 1e3 * shape.bend_mm(error / solution.model.prior.sigma),
+        "stated_um": 1e3 * shape.stated_mm(solution.found.factor),
+        "nees": (error * torch.linalg.solve(covariance, error)).sum(-1),
+        "largest_z": (error / covariance.diagonal(dim1=-2, dim2=-1).sqrt()).abs().amax(-1),
+        "noise_scale": solution.noise_scale,
+        "converged": solution.found.converged.double(),
+    }
+    return polars.DataFrame({name: values.numpy() for name, values in columns.items()})
+
+
+def _merits(runs: polars.DataFrame) -> dict[str, float]:
+    """Figures of merit over the runs of one point."""
+    bend, stated = ((polars.col(name) ** 2).mean().sqrt() for name in ("bend_um", "stated_um"))
+    found = runs.select(
+        bend.alias("height_error_um"),
+        stated.alias("stated_um"),
+        polars.col("nees").mean(),
+        polars.col("largest_z").max(),
+        polars.col("noise_scale").mean(),
+        polars.col("converged").mean(),
+    )
+    return {**found.row(0, named=True), "unknowns": float(SHARED)}
