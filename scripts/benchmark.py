@@ -1,11 +1,12 @@
 """Speed compared with a peer library, in one run on one machine: ``python scripts/benchmark.py NAME [--json]``.
 
 Every NAME is a file of ``scripts/benchmarks`` with a function ``run``, which returns the figures of both libraries and
-``ratio``, our throughput over the peer's.
+``ratio``, our throughput over the peer's. ``--full`` takes the camera's full size where a benchmark has two.
 """
 
 import argparse
 import importlib
+import inspect
 import json
 import os
 import platform
@@ -34,9 +35,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("name", choices=names)
     parser.add_argument("--json", action="store_true", help="print one JSON object as the last line")
+    parser.add_argument("--full", action="store_true", help="the camera's full size, where a benchmark has two")
     arguments = parser.parse_args()
     sys.path.insert(0, str(FOLDER))
-    figures = {"benchmark": arguments.name} | importlib.import_module(arguments.name).run() | {"machine": machine()}
+    run = importlib.import_module(arguments.name).run
+    if arguments.full and "full" not in inspect.signature(run).parameters:
+        parser.error(f"{arguments.name} has one size only")
+    measured = run(full=True) if arguments.full else run()
+    figures = {"benchmark": arguments.name} | measured | {"machine": machine()}
     if arguments.json:
         print(json.dumps(figures))
     else:

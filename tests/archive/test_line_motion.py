@@ -9,7 +9,7 @@ import pytest
 import torch
 import zarr
 
-from lsvision.archive import LEDGER_FILE, EngineConfig, Ledger, LineMotionChoice, plan_one, process_one
+from lsvision.archive import LEDGER_FILE, Engine, EngineConfig, Ledger, LineMotionChoice, plan_one, process_one
 from lsvision.archive.line_motion import FindLineMotion
 from lsvision.archive.work import CorrectStrip, MatchStrip
 from lsvision.errors import FileFormatError, ScansFailedError
@@ -350,6 +350,46 @@ def rail(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_scan(folder / "scans" / "rail", scan)
     make_calibration(folder / "n.json", rendered.trajectory.n.tolist(), rendered.rig)
     return folder
+
+
+@pytest.fixture(scope="module")
+def steadied(rail: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The rail's product, measured and corrected in this process."""
+    output = tmp_path_factory.mktemp("steadied") / "o"
+    process(rail / "scans", rail / "n.json", output, InProcess(1), AUTO)
+    return output
+
+
+def two_on_dask() -> Engine:
+    pytest.importorskip("distributed")
+    from lsvision.archive.engines.dask import DaskEngine
+
+    return DaskEngine(None, 2, PROCESSING.worker_memory_mb)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("engine", [lambda: local(2), two_on_dask], ids=["two workers", "a Dask cluster"])
+def test_workers_change_no_bit_of_what_is_measured(engine, rail, steadied, tmp_path):
+    other = replace(AUTO, correction=replace(AUTO.correction, strip_rows=96))
+    process(rail / "scans", rail / "n.json", tmp_path / "o", engine(), other)
+    assert_same_products(steadied, tmp_path / "o")
+    one, two = (read_product(output / "rail.zarr").metadata for output in (steadied, tmp_path / "o"))
+    assert one["line_motion"] == two["line_motion"]
+    assert "dz" in one["line_motion"]["corrected"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("last", [FindLineMotion, CorrectStrip])
+def test_what_was_ended_after_a_step_is_the_same_in_the_end(last, rail, steadied, tmp_path):
+    def interrupt(task, outcome):
+        if isinstance(task.work, last):
+            raise KeyboardInterrupt
+
+    planned = plan_one(rail / "scans" / "rail", rail / "n.json", AUTO)
+    with pytest.raises(KeyboardInterrupt):
+        process_one(planned, AUTO, tmp_path / "o", interrupt)
+    process_one(planned, AUTO, tmp_path / "o", ignore)
+    assert_same_products(steadied, tmp_path / "o")
 
 
 @pytest.mark.slow

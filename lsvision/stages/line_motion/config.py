@@ -15,8 +15,8 @@ class LineMotionConfig(Checked):
     less the further it lies off, and not at all beyond ``cut_sigma`` of its standard deviations: defects are outliers.
     Of the columns at most ``samples`` are used, as neighbours err alike. A line of which less than ``min_share`` of the
     object's samples was measured is interpolated from the others; so are all lines of which too few are left.
-    The errors of a line follow from its halves, which see the same motion; ``common_error_px`` of disparity is what a
-    line's depths err by all together (on rendered rails 0.005 to 0.013). ``expected_x_mm``, ``expected_z_mm`` and
+    The errors of a line follow from what the registration leaves; ``common_error_px`` of disparity is what a line's
+    depths err by all together besides (on rendered rails up to 0.005). ``expected_x_mm``, ``expected_z_mm`` and
     ``expected_roll_deg`` are the usual vibration (rms): they separate components that look alike on the profile, as
     roll and sideways motion of a crown. A component whose error on a line exceeds twice that is not observed.
     ``evidence`` is how much better, in units of the logarithm of the likelihood, the lines must fit with a component
@@ -28,11 +28,11 @@ class LineMotionConfig(Checked):
     height_range_mm: Interval = (-60.0, 60.0)
     profile_depth_mm: Positive = 40.0
     reference_lines: IntFrom2 = 512
-    samples: PositiveInt = 600
-    iterations: IntFrom2 = 6
+    samples: PositiveInt = 300
+    iterations: IntFrom2 = 4
     cut_sigma: Positive = 4.0
     min_share: Share = 0.3
-    common_error_px: NonNegative = 0.01
+    common_error_px: NonNegative = 0.004
     expected_x_mm: Positive = 0.2
     expected_z_mm: Positive = 0.2
     expected_roll_deg: Positive = 0.02

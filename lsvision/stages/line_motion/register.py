@@ -21,7 +21,7 @@ from lsvision.stages.line_motion.config import LineMotionConfig
 from lsvision.stages.line_motion.profiles import LineSamples, Reference
 
 # Standard deviations of displacements that no data restrict: mm, mm, rad. They keep the equations solvable.
-_LOOSE = (10.0, 10.0, 0.1)
+LOOSE_SIGMA = (10.0, 10.0, 0.1)
 _COARSE_MM = (4.0, 1.0)  # distances beyond which samples do not count in the first steps
 _LEAST_SIGMA_MM = 1e-3  # of a residual
 _PIECE_PX = 32  # columns that fall to one half, then to the other: matching errs alike over some 20
@@ -50,6 +50,20 @@ class Registered:
     def joined(cls, parts: Sequence["Registered"]) -> "Registered":
         """Those of several ranges of lines, one after the other."""
         return cls(*(torch.cat([getattr(part, field.name) for part in parts]) for field in fields(cls)))
+
+    @classmethod
+    def nothing(cls, lines: int) -> "Registered":
+        """Lines of which nothing is known yet.
+
+        Small results of many blocks, kept as they come, would hold the memory of what was freed between them.
+        """
+        zeros = torch.zeros(lines, 3, dtype=torch.float64)
+        return cls(zeros, zeros[..., None].repeat(1, 1, 3), zeros[:, 0].long(), zeros.clone(), zeros.clone())
+
+    def put(self, start: int, part: "Registered") -> None:
+        """Write the lines from ``start`` on."""
+        for field in fields(self):
+            getattr(self, field.name)[start : start + len(part.values)] = getattr(part, field.name)
 
 
 def placed(
@@ -81,11 +95,11 @@ def register(
     values = start - rise[:, None] * start.new_tensor([0.0, 1.0, 0.0])
     loose = _loose(values)
     for step in range(config.iterations + len(_COARSE_MM)):
-        equations = _equations(samples, values, reference, frame)
+        equations = equations_of(samples, values, reference, frame)
         cut = _COARSE_MM[step] if step < len(_COARSE_MM) else config.cut_sigma * equations.sigma
         normal = equations.weighted(cut)
         values = values - torch.linalg.solve(normal.information + loose, normal.slope)
-    equations = _equations(samples, values, reference, frame)
+    equations = equations_of(samples, values, reference, frame)
     difference, variance = torch.zeros_like(values), torch.zeros_like(values)
     half = (samples.columns - samples.columns[0]) // _PIECE_PX % 2
     for side, sign in ((0, 1.0), (1, -1.0)):
@@ -98,11 +112,11 @@ def register(
 
 def _loose(values: Tensor) -> Tensor:
     """Information that lets every displacement go."""
-    return torch.diag(values.new_tensor(_LOOSE) ** -2)
+    return torch.diag(values.new_tensor(LOOSE_SIGMA) ** -2)
 
 
 @dataclass(frozen=True)
-class _NormalEquations:
+class NormalEquations:
     """Jᵀ W J and Jᵀ W r of every line, and the samples that take part."""
 
     information: Float[Tensor, "lines 3 3"]
@@ -111,14 +125,14 @@ class _NormalEquations:
 
 
 @dataclass(frozen=True)
-class _Equations:
+class Equations:
     """Residuals of samples, their standard deviations, and their derivatives by the displacement of the line."""
 
     residual: Float[Tensor, "lines columns"]
     sigma: Float[Tensor, "lines columns"]
     by_motion: tuple[Tensor, Tensor, Tensor]
 
-    def weighted(self, cut: Tensor | float, among: Bool[Tensor, " columns"] | None = None) -> _NormalEquations:
+    def weighted(self, cut: Tensor | float, among: Bool[Tensor, " columns"] | None = None) -> NormalEquations:
         """The normal equations of all columns or some; samples beyond ``cut``, mm, do not count."""
         inside = (1 - (self.residual / cut).square()).clamp(min=0)  # NaN where nothing was measured
         weight = (inside / self.sigma).square()
@@ -127,10 +141,11 @@ class _Equations:
         rows = [by.masked_fill(~used, 0.0) for by in self.by_motion]
         heavy = [row * weight for row in rows]
         information = torch.stack([torch.stack([(a * b).sum(1) for b in rows], -1) for a in heavy], -2)
-        return _NormalEquations(information, torch.stack([(a * residual).sum(1) for a in heavy], -1), used)
+        return NormalEquations(information, torch.stack([(a * residual).sum(1) for a in heavy], -1), used)
 
 
-def _equations(samples: LineSamples, values: Tensor, reference: Reference, frame: ProductFrame) -> _Equations:
+def equations_of(samples: LineSamples, values: Tensor, reference: Reference, frame: ProductFrame) -> Equations:
+    """The equations of lines at displacements."""
     q_x, height = placed(samples, values, frame)
     level, slope = reference.at(q_x)
     axes, pivot = frame.axes, middle_point(frame.rig)
@@ -142,4 +157,4 @@ def _equations(samples: LineSamples, values: Tensor, reference: Reference, frame
     by_roll = g_z * (cos * x - sin * z) - g_x * (sin * x + cos * z)
     along_ray = samples.slope * by_x + by_z  # what -1 mm of depth does
     sigma = (samples.sigma * along_ray.abs()).clamp(min=_LEAST_SIGMA_MM)
-    return _Equations(height - level, sigma, (by_x, by_z, by_roll))
+    return Equations(height - level, sigma, (by_x, by_z, by_roll))

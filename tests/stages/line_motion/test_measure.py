@@ -75,6 +75,52 @@ def test_a_shaken_rail_is_measured_as_well_as_its_sigma_says() -> None:
     torch.testing.assert_close(found.values[:, 1].mean(), torch.zeros(()).double(), rtol=0, atol=1e-9)
 
 
+def mean_nees(found: LineMotion, source: Simulation) -> float:
+    """Mean over the lines of the squared error of all three components in units of its covariance."""
+    error, covariance = found.values[:, :3] - true_values(source), found.covariance[:, :3, :3]
+    return float((error[:, None] @ torch.linalg.solve(covariance, error[..., None])).mean())
+
+
+@pytest.mark.slow
+def test_errors_are_as_large_as_their_covariance_says() -> None:
+    """For all three components, roll included, though it is not observed; 400 lines hold some 20 errors each."""
+    squares = []
+    for seed in range(6):
+        source, depth = rendered(dataclasses.replace(SHAKEN, seed=seed))
+        found = measure(matched(depth, seed))
+        assert states(found) in (["corrected", "corrected", "not observed"], ["corrected", "corrected", "absent"])
+        squares.append(mean_nees(found, source))
+    assert 2.5 < sum(squares) / len(squares) < 3.6
+    assert max(squares) < 6.0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("lines", [slice(None), slice(100, 200)], ids=["all along", "for a quarter"])
+def test_half_a_profile_is_known_as_well_as_its_sigma_says(lines: slice) -> None:
+    squares = []
+    for seed in range(3):
+        source, depth = rendered(dataclasses.replace(SHAKEN, seed=seed))
+        half = matched(depth, seed)
+        half[lines, int(depth.median(0).values.argmin()) :] = torch.nan
+        found = measure(half)
+        assert states(found)[1] == "corrected"
+        assert (found.values[:, 1] - true_values(source)[:, 1]).square().mean().sqrt() < 0.02
+        squares.append(mean_nees(found, source))
+    assert 1.5 < sum(squares) / len(squares) < 4.5
+
+
+@pytest.mark.slow
+def test_lines_that_were_lost_or_knocked_are_interpolated() -> None:
+    source, depth = rendered(SHAKEN)
+    harmed = matched(depth)
+    for line in (50, 51, 300):
+        harmed[line] += 2.0
+    found = measure(harmed)
+    error = (found.values[:, 1] - true_values(source)[:, 1]).abs()
+    assert error[[50, 51, 300]].max() < 0.03
+    assert error.square().mean().sqrt() < 0.015
+
+
 @pytest.mark.slow
 def test_a_still_rail_keeps_every_bit() -> None:
     found = measure(matched(rendered(STILL)[1], seed=1))
