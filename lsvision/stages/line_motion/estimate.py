@@ -60,7 +60,7 @@ def estimate(
         usual_samples: how many samples of a line take part where nothing is missing.
         along_mm: travel of the lines. common_mm: what the depths of a line err by all together.
     """
-    data = _noisy_values(lines, usual_samples, config)
+    data = noisy_values(lines, usual_samples, config)
     count = len(data.values)
     needed = max(_LEAST_LINES, math.ceil(config.min_share * count))
     if int(data.valid.sum()) < needed:
@@ -76,7 +76,7 @@ def estimate(
     return LineMotion(pad(mean * keep, (0, 1)), pad(covariance * keep[:, None] * keep, (0, 1, 0, 1)), tuple(findings))
 
 
-def _noisy_values(lines: Registered, usual_samples: int, config: LineMotionConfig) -> NoisyValues:
+def noisy_values(lines: Registered, usual_samples: int, config: LineMotionConfig) -> NoisyValues:
     """Values of lines, measured where enough samples took part and the line is no spike among its neighbours."""
     root = torch.linalg.cholesky(lines.covariance)
     valid = (lines.samples >= max(1.0, config.min_share * usual_samples)) & lines.values.isfinite().all(1)

@@ -9,7 +9,7 @@ and an error of the depth moves r by g along the ray. Weights are Tukey's.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -24,7 +24,7 @@ from lsvision.stages.line_motion.profiles import LineSamples, Reference
 _LOOSE = (10.0, 10.0, 0.1)
 _COARSE_MM = (4.0, 1.0)  # distances beyond which samples do not count in the first steps
 _LEAST_SIGMA_MM = 1e-3  # of a residual
-_PIECE_PX = 32  # columns that fall to one half, then to the other: matching errs alike over some 20
+PIECE_PX = 32  # columns that fall to one half, then to the other: matching errs alike over some 20
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,8 @@ def placed(
     """(q_x, height), mm, of samples whose lines are displaced by ``values``."""
     axes = line_axes(frame.axes, pad(values, (0, 1)), middle_point(frame.rig))
     q_x, q_z = (
-        samples.z * (samples.slope * axes.across[:, i, None] + axes.ahead[:, i, None]) + axes.origin[:, i, None]
+        samples.z * (samples.slope * axes.across[:, i, None] + axes.ahead[:, i, None])
+        + (axes.origin[:, i, None] + samples.plane_y_mm * frame.axes[i, 1])
         for i in (0, 2)
     )
     return q_x, frame.height_datum_mm - q_z
@@ -79,18 +80,28 @@ def register(
     q_x, height = placed(samples, start, frame)
     rise = (height - reference.at(q_x)[0]).nanmedian(dim=1).values.nan_to_num()
     values = start - rise[:, None] * start.new_tensor([0.0, 1.0, 0.0])
-    loose = _loose(values)
     for step in range(config.iterations + len(_COARSE_MM)):
-        equations = _equations(samples, values, reference, frame)
+        equations = equations_of(samples, values, reference, frame)
         cut = _COARSE_MM[step] if step < len(_COARSE_MM) else config.cut_sigma * equations.sigma
         normal = equations.weighted(cut)
-        values = values - torch.linalg.solve(normal.information + loose, normal.slope)
-    equations = _equations(samples, values, reference, frame)
+        values = values + normal.step
+    equations = equations_of(samples, values, reference, frame)
+    return with_halves(values, normal, equations, samples.columns, config.cut_sigma)
+
+
+def with_halves(
+    values: Float[Tensor, "lines 3"],
+    normal: "NormalEquations",
+    equations: "Equations",
+    columns: Int[Tensor, " columns"],
+    cut_sigma: float,
+) -> Registered:
+    """Registered lines, from their last normal equations and the equations at their ``values``."""
     difference, variance = torch.zeros_like(values), torch.zeros_like(values)
-    half = (samples.columns - samples.columns[0]) // _PIECE_PX % 2
+    half = (columns - columns[0]) // PIECE_PX % 2
     for side, sign in ((0, 1.0), (1, -1.0)):
-        part = equations.weighted(config.cut_sigma * equations.sigma, half == side)
-        covariance = torch.linalg.inv(part.information + loose)
+        part = equations.weighted(cut_sigma * equations.sigma, half == side)
+        covariance = torch.linalg.inv(part.information + _loose(values))
         difference = difference - sign * (covariance @ part.slope[..., None])[..., 0]
         variance = variance + covariance.diagonal(dim1=-2, dim2=-1)
     return Registered(values, normal.information, normal.used.sum(1), difference, variance)
@@ -102,23 +113,33 @@ def _loose(values: Tensor) -> Tensor:
 
 
 @dataclass(frozen=True)
-class _NormalEquations:
+class NormalEquations:
     """Jᵀ W J and Jᵀ W r of every line, and the samples that take part."""
 
     information: Float[Tensor, "lines 3 3"]
     slope: Float[Tensor, "lines 3"]
     used: Bool[Tensor, "lines columns"]
 
+    @property
+    def step(self) -> Float[Tensor, "lines 3"]:
+        """Change of the displacement to the least squares."""
+        return -torch.linalg.solve(self.information + _loose(self.slope), self.slope)
+
 
 @dataclass(frozen=True)
-class _Equations:
+class Equations:
     """Residuals of samples, their standard deviations, and their derivatives by the displacement of the line."""
 
     residual: Float[Tensor, "lines columns"]
     sigma: Float[Tensor, "lines columns"]
     by_motion: tuple[Tensor, Tensor, Tensor]
 
-    def weighted(self, cut: Tensor | float, among: Bool[Tensor, " columns"] | None = None) -> _NormalEquations:
+    def moved_by(self, displacement: Float[Tensor, "lines 3"]) -> "Equations":
+        """The same at a displacement further by a little."""
+        change = sum(by * moved for by, moved in zip(self.by_motion, displacement.T[..., None], strict=True))
+        return replace(self, residual=self.residual + change)
+
+    def weighted(self, cut: Tensor | float, among: Bool[Tensor, " columns"] | None = None) -> NormalEquations:
         """The normal equations of all columns or some; samples beyond ``cut``, mm, do not count."""
         inside = (1 - (self.residual / cut).square()).clamp(min=0)  # NaN where nothing was measured
         weight = (inside / self.sigma).square()
@@ -127,10 +148,11 @@ class _Equations:
         rows = [by.masked_fill(~used, 0.0) for by in self.by_motion]
         heavy = [row * weight for row in rows]
         information = torch.stack([torch.stack([(a * b).sum(1) for b in rows], -1) for a in heavy], -2)
-        return _NormalEquations(information, torch.stack([(a * residual).sum(1) for a in heavy], -1), used)
+        return NormalEquations(information, torch.stack([(a * residual).sum(1) for a in heavy], -1), used)
 
 
-def _equations(samples: LineSamples, values: Tensor, reference: Reference, frame: ProductFrame) -> _Equations:
+def equations_of(samples: LineSamples, values: Tensor, reference: Reference, frame: ProductFrame) -> Equations:
+    """The equations of lines at displacements."""
     q_x, height = placed(samples, values, frame)
     level, slope = reference.at(q_x)
     axes, pivot = frame.axes, middle_point(frame.rig)
@@ -142,4 +164,4 @@ def _equations(samples: LineSamples, values: Tensor, reference: Reference, frame
     by_roll = g_z * (cos * x - sin * z) - g_x * (sin * x + cos * z)
     along_ray = samples.slope * by_x + by_z  # what -1 mm of depth does
     sigma = (samples.sigma * along_ray.abs()).clamp(min=_LEAST_SIGMA_MM)
-    return _Equations(height - level, sigma, (by_x, by_z, by_roll))
+    return Equations(height - level, sigma, (by_x, by_z, by_roll))
