@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from lsvision.estimation.signals import NoisyValues, SignalModel, filter_signals
+from lsvision.estimation.signals import NoisyValues, SignalModel, log_likelihood_of
 from lsvision.estimation.state_space_process import matern
 
 _FIRST_STEP = 0.7  # of the logarithms: a factor of two
@@ -89,7 +89,7 @@ def log_likelihood(parameters: SignalParameters, data: NoisyValues) -> Float[Ten
 
     model = parameters.at(parameters.logarithms()[:, None]).model()
     spread_data = NoisyValues(spread(data.values), spread(data.root), spread(data.valid))
-    return filter_signals(model, spread_data).log_likelihood.sum(-1)
+    return log_likelihood_of(model, spread_data).sum(-1)
 
 
 def fit_signals(

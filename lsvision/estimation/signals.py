@@ -21,12 +21,13 @@ from torch import Tensor
 
 from lsvision.estimation.filtering import StateSpace, Track, filter_sequence
 from lsvision.estimation.gaussian import Gaussian
-from lsvision.estimation.linalg import apply
-from lsvision.estimation.smoothing import smooth
+from lsvision.estimation.linalg import apply, product
+from lsvision.estimation.signal_filter import Measurements, SignalBlocks, filter_blocks
+from lsvision.estimation.signal_smoother import smooth_blocks
 from lsvision.estimation.state_space_process import Process
 
-# At once smoothed blocks: their factors fill some 50 MB.
-_BLOCKS_AT_ONCE = 64
+# At once smoothed blocks of some 600 samples with their halo: what they leave at every sample fills 30 MB.
+_BLOCKS_AT_ONCE = 32
 
 
 @dataclass(frozen=True)
@@ -83,9 +84,38 @@ class SignalModel:
         model = StateSpace(h, fresh, Q, lambda points: apply(F, points))
         return model, Gaussian(F.new_zeros(F.shape[:-1]), start)
 
+    def blocks(self, batch: Sequence[int]) -> SignalBlocks:
+        """The same states signal by signal, for every problem of a batch, which is flattened."""
+        size = max(process.size for process in self.processes) + 1
+        memory = self.memory.expand(*batch, -1)
+
+        def bordered(blocks: Sequence[Tensor], noise: Tensor) -> Tensor:
+            """Blocks of the processes with that of the noise in the last row."""
+            whole = noise.new_zeros(len(blocks), *batch, size, size)
+            for i, block in enumerate(blocks):
+                whole[i, ..., : block.shape[-1], : block.shape[-1]] = block
+                whole[i, ..., -1, -1] = noise[..., i]
+            return whole.flatten(1, -3).movedim(1, -1).contiguous()
+
+        return SignalBlocks(
+            bordered([process.transition for process in self.processes], memory),
+            bordered([product(each.noise_root, each.noise_root.mT) for each in self.processes], 1 - memory.square()),
+            bordered(
+                [product(each.start_root, each.start_root.mT) for each in self.processes], torch.ones_like(memory)
+            ),
+        )
+
+    def measurements(self, data: NoisyValues) -> Measurements:
+        """What ``filter_blocks`` takes, for every problem of a batch, which is flattened."""
+        root = (self.noise_scale[..., None] * data.root).flatten(1, -3)
+        lasting, fresh = (1 - self.white) ** 0.5 * root, self.white * product(root, root.mT)
+        values = data.values.nan_to_num().flatten(1, -2)
+        values, lasting, fresh = (each.movedim(1, -1).contiguous() for each in (values, lasting, fresh))
+        return Measurements(values, lasting, fresh, data.valid.flatten(1))
+
 
 def filter_signals(model: SignalModel, data: NoisyValues, *, history: bool = False) -> Track:
-    """Filter signals sample by sample; the innovations are those of every value from all before it.
+    """Library API: filter signals sample by sample in square-root form, for the innovations of every value.
 
     Args:
         data: a sequence, or a batch of them side by side.
@@ -106,18 +136,30 @@ def smooth_signals(
     samples = len(data.values)
     starts = torch.arange(0, samples, block)
     within = torch.arange(-halo, block + halo)
-    parts = []
-    for group in starts.split(_BLOCKS_AT_ONCE):
-        blocks = data.at(within[:, None] + group)
-        space, start = model.state_space(blocks)
-        track = filter_sequence(space, start, blocks.values.nan_to_num(), blocks.valid)
-        posterior = smooth(track, space)
-        inner = slice(halo, halo + block)
-        rows = posterior.factor[inner][..., model.places, :]
-        mean, covariance = posterior.mean[inner][..., model.places], rows @ rows.mT
-        parts.append((mean.transpose(0, 1).flatten(0, 1), covariance.transpose(0, 1).flatten(0, 1)))
+    parts = [
+        _smoothed(model, data.at(within[:, None] + group), slice(halo, halo + block))
+        for group in starts.split(_BLOCKS_AT_ONCE)
+    ]
     means, covariances = (torch.cat(part)[:samples] for part in zip(*parts, strict=True))
     return means, covariances
+
+
+def log_likelihood_of(model: SignalModel, data: NoisyValues) -> Float[Tensor, "*batch"]:
+    """Logarithm of the likelihood of every sequence of a batch, by its innovations."""
+    batch = data.valid.shape[1:]
+    with torch.inference_mode():
+        measured = model.measurements(data)
+        found = filter_blocks(model.blocks(batch), measured).log_likelihood(measured.valid)
+    return found.clone().unflatten(0, batch)  # outside: tensors of inference cannot be used in gradients
+
+
+def _smoothed(model: SignalModel, blocks: NoisyValues, inner: slice) -> tuple[Tensor, Tensor]:
+    """Mean and covariance of the inner samples of blocks side by side, one block after the other."""
+    with torch.inference_mode():
+        measured, states = model.measurements(blocks), model.blocks(blocks.valid.shape[1:])
+        found = smooth_blocks(states, measured, filter_blocks(states, measured), inner)
+        mean, covariance = (each.movedim(-1, 0).flatten(0, 1) for each in (found.mean, found.covariance))
+    return mean.clone(), covariance.clone()
 
 
 def _block_diagonal(parts: Sequence[Tensor], batch: Sequence[int]) -> Tensor:

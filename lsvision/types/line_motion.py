@@ -64,7 +64,8 @@ class LineMotion:
 
     Attributes:
         values: (δx, δz, ρ, δy) by line, float64; zero for a component that is not corrected.
-        covariance: of ``values``, by line; zero in the rows of components that are not corrected.
+        covariance: of what ``values`` err by, by line. A component that is not corrected, where others are, may be
+            there: it errs by what is thought of it. All zero where nothing is corrected.
         findings: what is known about each component; empty where the motion was given from outside.
     """
 

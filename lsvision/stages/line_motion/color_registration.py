@@ -26,8 +26,9 @@ from lsvision.image.stereo.warp import warp_cubic
 from lsvision.image.stereo.windows import row_window_sum
 from lsvision.stages.line_motion.color_pair import ColorPair
 from lsvision.stages.line_motion.profiles import LineSamples, Reference
-from lsvision.stages.line_motion.register import PIECE_PX, Registered, equations_of
+from lsvision.stages.line_motion.register import Registered, equations_of
 
+_PIECE_PX = 32  # columns that fall to one half, then to the other
 _AROUND_PX = 31  # columns over which means are taken
 _STEPS = 3
 _TUKEY = 4.685  # standard deviations: 95 % as good as least squares where there are no outliers
@@ -58,7 +59,7 @@ def register_color(
     for _ in range(_STEPS):
         fit = rows.at(moved).fit(rows.valid)
         moved = moved + fit.step
-    half = torch.arange(rows.valid.shape[1]) // PIECE_PX % 2
+    half = torch.arange(rows.valid.shape[1]) // _PIECE_PX % 2
     left_over = rows.at(moved)
     one, other = (left_over.fit(rows.valid & (half == side)) for side in range(2))
     # The weights of outliers follow a step; what they would make of it is part of it.

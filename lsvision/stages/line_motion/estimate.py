@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import pad
 
@@ -38,6 +38,7 @@ _SPREADS = {"sigma": 2.5, "length": 1.5, "noise_scale": 0.7, "memory": 0.7}  # o
 _NOTHING = 1e-3  # of the errors of a line: a component that is not there
 _OBSERVED = 2.0  # errors of a line over what a component usually amounts to, at most
 _SPIKE_SIGMA, _SPIKE_LINES = 8.0, 9
+_LINES_AT_ONCE = 4096
 
 
 def not_measured(lines: int, reason: str) -> LineMotion:
@@ -51,14 +52,14 @@ def estimate(
     lines: Registered,
     usual_samples: int,
     along_mm: Float[Tensor, " lines"],
-    common_mm: float,
+    errors: LineErrors,
     config: LineMotionConfig,
 ) -> LineMotion:
     """Motion from line to line of registered lines.
 
     Args:
         usual_samples: how many samples of a line take part where nothing is missing.
-        along_mm: travel of the lines. common_mm: what the depths of a line err by all together.
+        along_mm: travel of the lines. errors: of single lines.
     """
     data = noisy_values(lines, usual_samples, config)
     count = len(data.values)
@@ -67,13 +68,29 @@ def estimate(
         return not_measured(
             count, f"only {int(data.valid.sum())} of {count} lines show the profile, {needed} are needed"
         )
-    fit = _Fit.of(data, LineErrors.of(lines, data, common_mm), config)
+    fit = _Fit.of(data, errors, config)
     mean, covariance = smooth_signals(fit.parameters.model(), data, block=config.block_lines, halo=config.halo_lines)
+    kept = fit.is_corrected(config)
+    mean, covariance = _without_the_others(mean, covariance, kept)
     mean = without_trend(along_mm)(mean.T).T
     pitch = float(along_mm.diff().abs().mean())
     findings = [fit.finding(i, mean[:, i], covariance[:, i, i], pitch, config) for i in range(3)]
-    keep = mean.new_tensor([finding.state == "corrected" for finding in findings])
-    return LineMotion(pad(mean * keep, (0, 1)), pad(covariance * keep[:, None] * keep, (0, 1, 0, 1)), tuple(findings))
+    return LineMotion(pad(mean, (0, 1)), pad(covariance, (0, 1, 0, 1)), tuple(findings))
+
+
+def _without_the_others(mean: Tensor, covariance: Tensor, kept: Tensor) -> tuple[Tensor, Tensor]:
+    """Means of the components that are corrected where the others are zero, and second moments of what all err then.
+
+    Not correcting a component moves the others by what they share: a small roll left in place of a rail beside the
+    pivot is a displacement in depth, and the profile shows their sum.
+    """
+    if not bool(kept.any()):
+        return torch.zeros_like(mean), torch.zeros_like(covariance)
+    other = ~kept
+    among, across = covariance[:, other][:, :, other], covariance[:, kept][:, :, other]
+    left = mean * other
+    left[:, kept] = (across @ torch.linalg.solve(among, mean[:, other, None]))[..., 0]
+    return (mean - left) * kept, covariance + left[:, :, None] * left[:, None]
 
 
 def noisy_values(lines: Registered, usual_samples: int, config: LineMotionConfig) -> NoisyValues:
@@ -84,7 +101,8 @@ def noisy_values(lines: Registered, usual_samples: int, config: LineMotionConfig
     values = values - values.nanmedian(0).values.nan_to_num()
     half = _SPIKE_LINES // 2
     around = torch.cat([values[:1].expand(half, -1), values, values[-1:].expand(half, -1)]).unfold(0, _SPIKE_LINES, 1)
-    off = (values - around.nanmedian(-1).values).abs()
+    medians = [some.nanmedian(-1).values for some in around.split(_LINES_AT_ONCE)]
+    off = (values - torch.cat(medians)).abs()
     usual = (NORMAL_OVER_MAD * off.nanmedian(0).values).nan_to_num()  # due to the motion itself and correlated errors
     valid &= ~(off > _SPIKE_SIGMA * root.square().sum(-1).sqrt().maximum(usual)).any(1)
     return NoisyValues(torch.where(valid[:, None], values, 0.0), root, valid)
@@ -103,34 +121,41 @@ class _Fit:
         """Fit the processes to lines with known errors."""
         stride, sequences = _thinned(data, errors)
         spread = (data.values[data.valid].square().mean(0) - errors.rms.square()).clamp(min=0).sqrt()
-        expected = _expected(config)
+        expected, observed = _expected(config), _observed(errors.rms, config)
         usual = SignalParameters(
             _USUAL_STATES, expected, torch.full_like(expected, _USUAL_LENGTH), errors.scale, errors.memory
         ).thinned(float(stride))
         log_prior, signals = _Prior(usual), len(expected)
-        free = torch.cat([torch.ones(2 * signals), torch.zeros(2 * signals)]).to(expected)
-        start = replace(usual, sigma=spread.maximum(expected / 2))
-        fit = fit_signals(start, sequences, log_prior, free, iterations=8)
+        # What the lines do not show is as large as usual.
+        free = torch.stack([observed, observed, observed & False, observed & False]).to(expected)
+        start = replace(usual, sigma=torch.where(observed, spread.maximum(expected / 2), expected))
+        fit = fit_signals(start, sequences, log_prior, free.flatten(), iterations=8)
         for states in _OTHER_STATES:
-            other = fit_signals(replace(fit.parameters, states=states), sequences, log_prior, free, iterations=3)
+            other = fit_signals(
+                replace(fit.parameters, states=states), sequences, log_prior, free.flatten(), iterations=3
+            )
             fit = other if other.log_density > fit.log_density else fit
         evidence = [
-            fit.log_density - _without(fit, i, errors.rms, start.sigma, sequences, log_prior)
-            if fit.parameters.sigma[i] > config.least_ratio * errors.rms[i] and _is_observed(errors.rms, i, config)
+            fit.log_density - _without(fit, i, errors.rms, start.sigma, free, sequences, log_prior)
+            if observed[i] and fit.parameters.sigma[i] > config.least_ratio * errors.rms[i]
             else 0.0
             for i in range(signals)
         ]
         return cls(fit.parameters.thinned(1 / stride), evidence, errors.rms)
 
+    def is_corrected(self, config: LineMotionConfig) -> Bool[Tensor, " signals"]:
+        """Which components are observed, likely and larger than the errors of a line."""
+        likely = self.noise.new_tensor(self.evidence) > config.evidence
+        return _observed(self.noise, config) & likely & (self.parameters.sigma > config.least_ratio * self.noise)
+
     def finding(
         self, index: int, mean: Tensor, variance: Tensor, pitch_mm: float, config: LineMotionConfig
     ) -> LineFinding:
         """What is known about a component, from its smoothed values."""
-        name, sigma = LINE_COMPONENTS[index], float(self.parameters.sigma[index])
-        noise, rms = float(self.noise[index]), float(_rms(mean))
-        if not _is_observed(self.noise, index, config):
+        name, noise, rms = LINE_COMPONENTS[index], float(self.noise[index]), float(_rms(mean))
+        if not _observed(self.noise, config)[index]:
             return LineFinding(name, "not observed", sigma=noise)
-        if sigma > config.least_ratio * noise and self.evidence[index] > config.evidence:
+        if self.is_corrected(config)[index]:
             length = float(self.parameters.length[index]) * pitch_mm
             return LineFinding(name, "corrected", rms, float(variance.mean().sqrt()), length, self.evidence[index])
         return LineFinding(name, "absent", sigma=noise, evidence=self.evidence[index])
@@ -152,7 +177,13 @@ class _Prior:
 
 
 def _without(
-    fit: SignalFit, index: int, noise: Tensor, large: Tensor, sequences: NoisyValues, log_prior: _Prior
+    fit: SignalFit,
+    index: int,
+    noise: Tensor,
+    large: Tensor,
+    free: Tensor,
+    sequences: NoisyValues,
+    log_prior: _Prior,
 ) -> float:
     """Logarithm of the density where one component is not there, and its noise and the others explain what they can.
 
@@ -161,8 +192,7 @@ def _without(
     """
     sigma = large.maximum(fit.parameters.sigma)
     sigma[index] = _NOTHING * noise[index]
-    free = torch.ones(4, len(noise), dtype=noise.dtype)
-    free[2:] = 0.0
+    free = free.clone()
     free[:, index] = free.new_tensor([0.0, 0.0, 1.0, 1.0])
     found = fit_signals(replace(fit.parameters, sigma=sigma), sequences, log_prior, free.flatten(), iterations=6)
     # That the prior finds a sigma of nothing unlikely is no evidence.
@@ -176,9 +206,9 @@ def _expected(config: LineMotionConfig) -> Float[Tensor, "3"]:
     return torch.tensor([config.expected_x_mm, config.expected_z_mm, roll], dtype=torch.float64)
 
 
-def _is_observed(noise: Float[Tensor, "3"], index: int, config: LineMotionConfig) -> bool:
-    """Whether the error of a line is at most twice what a component usually amounts to."""
-    return bool(noise[index] <= _OBSERVED * _expected(config)[index])
+def _observed(noise: Float[Tensor, "3"], config: LineMotionConfig) -> Bool[Tensor, "3"]:
+    """Of which components the error of a line is at most twice what they usually amount to."""
+    return noise <= _OBSERVED * _expected(config)
 
 
 def _as_batch(parameters: SignalParameters) -> SignalParameters:

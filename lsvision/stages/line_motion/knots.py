@@ -67,37 +67,31 @@ class Knots:
         return (weights * values[taps]).sum(1)
 
 
-@dataclass(frozen=True)
-class Displacements:
-    """One component of the displacement of lines, or of its differences, the errors that halves show, what counts."""
-
-    values: Float[Tensor, " lines"]
-    errors: Float[Tensor, " lines"]
-    valid: Bool[Tensor, " lines"]
-
-
 def shared_signal(
-    knots: Knots, profile: Displacements, differences: ColorDifferences, component: int, common_mm: float
+    knots: Knots,
+    values: Float[Tensor, " lines"],
+    valid: Bool[Tensor, " lines"],
+    sigma: float,
+    differences: ColorDifferences,
+    component: int,
 ) -> SharedSignal:
     """What the profile shows of one component of the displacement, and what the colours do.
 
     Args:
-        common_mm: what the profile errs by that its halves do not show.
+        values: that the profile shows, where ``valid``. sigma: of means over the lines of a knot, as if white.
     """
-    total, total_valid = knots.means(profile.values, profile.valid)
-    error, _ = knots.means(profile.errors, profile.valid)
+    total, total_valid = knots.means(values, valid)
     moved = differences.values[:, component]
-    measured = _no_outliers(moved)
-    first = -round(differences.ahead) - knots.size // 2
+    measured, first = _no_outliers(moved), -round(differences.ahead) - knots.size // 2
     difference, difference_valid = knots.means(moved, measured, first)
-    unsure, _ = knots.means(differences.errors[:, component], measured, first)
+    errors, _ = knots.means(differences.errors[:, component], measured, first)
     return SharedSignal(
         total=total,
         total_valid=total_valid,
-        total_sigma=max(_long_wave_sigma(error[total_valid]), common_mm),
+        total_sigma=sigma,
         difference=difference - difference[difference_valid].mean().nan_to_num(),
         difference_valid=difference_valid,
-        difference_sigma=_long_wave_sigma(unsure[difference_valid]),
+        difference_sigma=_long_wave_sigma(errors[difference_valid]),
         ratio=differences.lag / knots.size,
     )
 

@@ -9,7 +9,6 @@ lines of the colours, or a stated prior, tell them apart (``shape``).
 """
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import torch
@@ -20,17 +19,20 @@ from lsvision.stages.disparity.depth import relation_of_scan
 from lsvision.stages.line_motion.color_differences import ColorDifferences, measure_color_differences
 from lsvision.stages.line_motion.color_pair import color_pair
 from lsvision.stages.line_motion.config import LineMotionConfig
+from lsvision.stages.line_motion.errors import ErrorSums, LineErrors
 from lsvision.stages.line_motion.estimate import estimate, noisy_values, not_measured
 from lsvision.stages.line_motion.profiles import LineSamples, Reference, columns_of, reference_profile
-from lsvision.stages.line_motion.register import Registered, placed, register
+from lsvision.stages.line_motion.register import Registered, equations_of, placed, register
 from lsvision.stages.line_motion.shape import ShapeData, without_shape
 from lsvision.types import Depth, DepthSource, LineMotion, Motion, Scan
 
 _WINDOWS = 8  # of neighbouring lines, that the reference of a long scan comes from
 _APART = 4  # lines of a window; neighbours err alike
-_READ_LINES = 1024  # registered at once
+_READ_LINES, _AT_ONCE = 1024, 256  # read and registered at once
+_SUMMED_READS = 8  # whose residuals say how large the errors are
 _ROUNDS = 3  # of aligning lines and making the reference of them
-_CROWN_SHARE = 0.95  # of the heights of a line: about its crown
+_CROWN_SHARE = 0.95  # of the heights of a line: about its crown, or lower
+_BELOW_MM = 5.0  # of the profile's depth, from where on samples take no part
 
 
 def measure_line_motion(scan: Scan, depth: DepthSource, motion: Motion, config: LineMotionConfig) -> LineMotion:
@@ -46,15 +48,15 @@ def measure_line_motion(scan: Scan, depth: DepthSource, motion: Motion, config: 
     shown = _shown(frame, depth, config)
     if shown is None:
         return not_measured(depth.lines, "no profile that half of the lines show was measured")
-    lines = Registered.joined(list(_registered(frame, depth, shown, config)))
+    lines, sums = _registered(frame, depth, shown, config)
+    errors = LineErrors.of(sums, depth_step_mm(scan.rig, config.common_error_px))
     along = travel_at(scan.travel, torch.arange(depth.lines).double())
-    common_mm = depth_step_mm(scan.rig, config.common_error_px)
-    motion_seen = estimate(lines, shown.samples, along, common_mm, config)
-    if motion_seen.is_still:
-        return motion_seen
+    found = estimate(lines, shown.samples, along, errors, config)
+    if found.is_still:
+        return found
     valid = noisy_values(lines, shown.samples, config).valid
     differences = _color_differences(scan, frame, depth, lines, shown, config)
-    return without_shape(motion_seen, ShapeData(lines, valid, along, differences, common_mm), config)
+    return without_shape(found, ShapeData(lines, valid, along, errors, differences), config)
 
 
 @dataclass(frozen=True)
@@ -71,9 +73,11 @@ def _shown(frame: ProductFrame, depth: DepthSource, config: LineMotionConfig) ->
     spread = _spread_lines(depth, config.reference_lines)
     samples = LineSamples.of(spread, frame, config.height_range_mm, slice(None))
     values = samples.z.new_zeros(len(samples.z), 3)
-    crown = placed(samples, values, frame)[1].nanquantile(_CROWN_SHARE, dim=1).nan_to_num()
+    height = placed(samples, values, frame)[1]
+    crown = height.nanquantile(_CROWN_SHARE, dim=1).nan_to_num()
     values[:, 1] = crown - crown.median()
-    shown = None
+    samples = samples.among(height >= crown[:, None] - config.profile_depth_mm - _BELOW_MM)
+    first, shown = int(samples.columns[0]), None
     for _ in range(_ROUNDS):
         q_x, height = placed(samples, values, frame)
         reference = reference_profile(q_x, height, object_pitch_mm(frame.rig), config.profile_depth_mm)
@@ -84,18 +88,29 @@ def _shown(frame: ProductFrame, depth: DepthSource, config: LineMotionConfig) ->
             return None
         found = register(samples.on(columns), values, reference, frame, config)
         values = found.values - found.values.median(0).values
+        columns = slice(first + columns.start, first + columns.stop, columns.step)
         shown = _Shown(reference, columns, int(found.samples.median()))
     return shown
 
 
 def _registered(
     frame: ProductFrame, depth: DepthSource, shown: _Shown, config: LineMotionConfig
-) -> Iterator[Registered]:
-    """The lines of a scan, block by block."""
-    for start in range(0, depth.lines, _READ_LINES):
+) -> tuple[Registered, ErrorSums]:
+    """The lines of a scan, a few at a time, and sums over what is left of them at places all over the scan."""
+    starts = range(0, depth.lines, _READ_LINES)
+    summed = {i * (len(starts) - 1) // (_SUMMED_READS - 1) for i in range(_SUMMED_READS)}
+    lines, sums = Registered.nothing(depth.lines), []
+    for number, start in enumerate(starts):
         block = depth.read(start, min(start + _READ_LINES, depth.lines))
         samples = LineSamples.of(block, frame, config.height_range_mm, shown.columns)
-        yield register(samples, samples.z.new_zeros(len(samples.z), 3), shown.reference, frame, config)
+        for part in samples.split(_AT_ONCE):
+            found = register(part, part.z.new_zeros(len(part.z), 3), shown.reference, frame, config)
+            lines.put(start, found)
+            start += len(part.z)
+            if number in summed:
+                equations = equations_of(part, found.values, shown.reference, frame)
+                sums.append(ErrorSums.of(equations, config.cut_sigma))
+    return lines, ErrorSums.total(sums)
 
 
 def _color_differences(

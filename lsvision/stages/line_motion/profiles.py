@@ -1,10 +1,10 @@
 """Samples of lines in the product frame, and the object's reference profile that they are compared with."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from lsvision.estimation import NORMAL_OVER_MAD
@@ -46,6 +46,18 @@ class LineSamples:
         """Those of some columns."""
         parts = self.z[:, columns], self.sigma[:, columns], self.slope[columns], self.columns[columns]
         return LineSamples(*parts, self.plane_y_mm)
+
+    def among(self, seen: Bool[Tensor, "lines columns"]) -> "LineSamples":
+        """Those ``seen``, on the columns between the first and the last that any line has."""
+        some = seen.any(0).nonzero()[:, 0]
+        columns = slice(int(some[0]), int(some[-1]) + 1) if len(some) else slice(0, 1)
+        part = self.on(columns)
+        return replace(part, z=part.z.masked_fill(~seen[:, columns], torch.nan))
+
+    def split(self, lines: int) -> "list[LineSamples]":
+        """Those of some lines after the other."""
+        parts = zip(self.z.split(lines), self.sigma.split(lines), strict=True)
+        return [LineSamples(z, sigma, self.slope, self.columns) for z, sigma in parts]
 
 
 @dataclass(frozen=True)
@@ -134,8 +146,8 @@ def columns_of(reference: Reference, q_x: Float[Tensor, "lines columns"], most: 
 
 def _median_by_node(node: Int[Tensor, " values"], values: Float[Tensor, " values"]) -> Float[Tensor, " nodes"]:
     """Median of the values of every node from 0 on."""
-    order = values.argsort()
-    order = order[node[order].argsort(stable=True)]
+    level = values - values.min()
+    order = (node + level / (2 * level.max() + 1)).argsort()  # by node, then by value
     count = torch.bincount(node)
     middle = count.cumsum(0) - count + count // 2
     return values[order][middle.clamp(max=len(values) - 1)]

@@ -9,7 +9,7 @@ and an error of the depth moves r by g along the ray. Weights are Tukey's.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -24,7 +24,7 @@ from lsvision.stages.line_motion.profiles import LineSamples, Reference
 _LOOSE = (10.0, 10.0, 0.1)
 _COARSE_MM = (4.0, 1.0)  # distances beyond which samples do not count in the first steps
 _LEAST_SIGMA_MM = 1e-3  # of a residual
-PIECE_PX = 32  # columns that fall to one half, then to the other: matching errs alike over some 20
+_PIECE_PX = 32  # columns that fall to one half, then to the other: matching errs alike over some 20
 
 
 @dataclass(frozen=True)
@@ -50,6 +50,20 @@ class Registered:
     def joined(cls, parts: Sequence["Registered"]) -> "Registered":
         """Those of several ranges of lines, one after the other."""
         return cls(*(torch.cat([getattr(part, field.name) for part in parts]) for field in fields(cls)))
+
+    @classmethod
+    def nothing(cls, lines: int) -> "Registered":
+        """Lines of which nothing is known yet.
+
+        Small results of many blocks, kept as they come, would hold the memory of what was freed between them.
+        """
+        zeros = torch.zeros(lines, 3, dtype=torch.float64)
+        return cls(zeros, zeros[..., None].repeat(1, 1, 3), zeros[:, 0].long(), zeros.clone(), zeros.clone())
+
+    def put(self, start: int, part: "Registered") -> None:
+        """Write the lines from ``start`` on."""
+        for field in fields(self):
+            getattr(self, field.name)[start : start + len(part.values)] = getattr(part, field.name)
 
 
 def placed(
@@ -80,28 +94,18 @@ def register(
     q_x, height = placed(samples, start, frame)
     rise = (height - reference.at(q_x)[0]).nanmedian(dim=1).values.nan_to_num()
     values = start - rise[:, None] * start.new_tensor([0.0, 1.0, 0.0])
+    loose = _loose(values)
     for step in range(config.iterations + len(_COARSE_MM)):
         equations = equations_of(samples, values, reference, frame)
         cut = _COARSE_MM[step] if step < len(_COARSE_MM) else config.cut_sigma * equations.sigma
         normal = equations.weighted(cut)
-        values = values + normal.step
+        values = values - torch.linalg.solve(normal.information + loose, normal.slope)
     equations = equations_of(samples, values, reference, frame)
-    return with_halves(values, normal, equations, samples.columns, config.cut_sigma)
-
-
-def with_halves(
-    values: Float[Tensor, "lines 3"],
-    normal: "NormalEquations",
-    equations: "Equations",
-    columns: Int[Tensor, " columns"],
-    cut_sigma: float,
-) -> Registered:
-    """Registered lines, from their last normal equations and the equations at their ``values``."""
     difference, variance = torch.zeros_like(values), torch.zeros_like(values)
-    half = (columns - columns[0]) // PIECE_PX % 2
+    half = (samples.columns - samples.columns[0]) // _PIECE_PX % 2
     for side, sign in ((0, 1.0), (1, -1.0)):
-        part = equations.weighted(cut_sigma * equations.sigma, half == side)
-        covariance = torch.linalg.inv(part.information + _loose(values))
+        part = equations.weighted(config.cut_sigma * equations.sigma, half == side)
+        covariance = torch.linalg.inv(part.information + loose)
         difference = difference - sign * (covariance @ part.slope[..., None])[..., 0]
         variance = variance + covariance.diagonal(dim1=-2, dim2=-1)
     return Registered(values, normal.information, normal.used.sum(1), difference, variance)
@@ -120,11 +124,6 @@ class NormalEquations:
     slope: Float[Tensor, "lines 3"]
     used: Bool[Tensor, "lines columns"]
 
-    @property
-    def step(self) -> Float[Tensor, "lines 3"]:
-        """Change of the displacement to the least squares."""
-        return -torch.linalg.solve(self.information + _loose(self.slope), self.slope)
-
 
 @dataclass(frozen=True)
 class Equations:
@@ -133,11 +132,6 @@ class Equations:
     residual: Float[Tensor, "lines columns"]
     sigma: Float[Tensor, "lines columns"]
     by_motion: tuple[Tensor, Tensor, Tensor]
-
-    def moved_by(self, displacement: Float[Tensor, "lines 3"]) -> "Equations":
-        """The same at a displacement further by a little."""
-        change = sum(by * moved for by, moved in zip(self.by_motion, displacement.T[..., None], strict=True))
-        return replace(self, residual=self.residual + change)
 
     def weighted(self, cut: Tensor | float, among: Bool[Tensor, " columns"] | None = None) -> NormalEquations:
         """The normal equations of all columns or some; samples beyond ``cut``, mm, do not count."""

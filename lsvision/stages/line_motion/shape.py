@@ -16,7 +16,8 @@ from lsvision.estimation import SharedFit, SharedSignal, fit_shares, smooth_shar
 from lsvision.geometry import without_trend
 from lsvision.stages.line_motion.color_differences import ColorDifferences
 from lsvision.stages.line_motion.config import LineMotionConfig
-from lsvision.stages.line_motion.knots import Displacements, Knots, shared_signal
+from lsvision.stages.line_motion.errors import LineErrors
+from lsvision.stages.line_motion.knots import Knots, shared_signal
 from lsvision.stages.line_motion.register import Registered
 from lsvision.types import LineFinding, LineMotion
 
@@ -32,21 +33,25 @@ class ShapeData:
     """What the split of a motion into displacement and shape needs to know of its lines.
 
     Attributes:
-        lines: as registered, and ``valid`` which of them count. along_mm: their travel.
+        lines: as registered, and ``valid`` which of them count. along_mm: their travel. errors: of them.
         differences: of the colours; None where all look at one line.
-        common_mm: what the depths of a line err by all together.
     """
 
     lines: Registered
     valid: Bool[Tensor, " lines"]
     along_mm: Float[Tensor, " lines"]
+    errors: LineErrors
     differences: ColorDifferences | None
-    common_mm: float
 
     @property
     def pitch_mm(self) -> float:
         """Distance of neighbouring lines."""
         return float(self.along_mm.diff().abs().mean())
+
+    def knot_sigma(self, index: int, lines: int) -> float:
+        """Errors of means over some neighbouring lines, as large as white ones with as much power in long waves."""
+        kept = math.exp(-1 / float(self.errors.memory[index]))
+        return float(self.errors.rms[index]) * math.sqrt((1 + kept) / (1 - kept) / lines)
 
 
 def without_shape(motion: LineMotion, data: ShapeData, config: LineMotionConfig) -> LineMotion:
@@ -88,8 +93,8 @@ def _shape_of(
     knots = Knots.of(len(values), data.differences)
     if knots.count < _LEAST_KNOTS:
         return shape
-    shown = Displacements(data.lines.values[:, index] - shape.mean, data.lines.difference[:, index] / 2, data.valid)
-    signal = shared_signal(knots, shown, data.differences, index, data.common_mm if index == 1 else 0.0)
+    left, sigma = data.lines.values[:, index] - shape.mean, data.knot_sigma(index, knots.size)
+    signal = shared_signal(knots, left, data.valid, sigma, data.differences, index)
     return _with_colors(shape, knots, signal, data.pitch_mm, config)
 
 

@@ -1,4 +1,4 @@
-"""Registration of single lines, and the errors that their halves show, on exact depth of a rendered rail."""
+"""Registration of single lines, and the errors that its residuals show, on exact depth of a rendered rail."""
 
 import dataclasses
 import math
@@ -7,13 +7,12 @@ import pytest
 import torch
 from torch import Tensor
 
-from lsvision.estimation import NoisyValues
 from lsvision.geometry import ProductFrame, object_pitch_mm
 from lsvision.simulation import SceneConfig
 from lsvision.stages.line_motion.config import LineMotionConfig
-from lsvision.stages.line_motion.errors import LineErrors
+from lsvision.stages.line_motion.errors import ErrorSums, LineErrors
 from lsvision.stages.line_motion.profiles import LineSamples, Reference, columns_of, reference_profile
-from lsvision.stages.line_motion.register import Registered, placed, register
+from lsvision.stages.line_motion.register import Registered, equations_of, placed, register
 from lsvision.types import Depth
 from tests.stages.line_motion.test_measure import RIG, SHAKEN, SIGMA_MM, STILL, matched, rendered
 
@@ -59,6 +58,10 @@ def test_batch_equals_loop() -> None:
         torch.testing.assert_close(getattr(alone, part.name)[0], getattr(whole, part.name)[2], rtol=1e-9, atol=1e-12)
     twice = Registered.joined([alone, alone])
     assert torch.equal(twice.values[0], twice.values[1])
+    kept = Registered.nothing(4)
+    kept.put(2, alone)
+    assert torch.equal(kept.values[2], alone.values[0])
+    assert not kept.information[[0, 1, 3]].any()
 
 
 def test_information_is_that_of_independent_samples() -> None:
@@ -73,18 +76,45 @@ def test_information_is_that_of_independent_samples() -> None:
     assert ((halves > 0.7) & (halves < 1.3)).all()
 
 
-def test_errors_of_neighbours_show_in_the_halves() -> None:
+def sums_of(lines: LineSamples, at: Tensor) -> ErrorSums:
+    equations = equations_of(lines, at, reference()[0], frame())
+    return ErrorSums.of(equations, CONFIG.cut_sigma)
+
+
+def test_errors_of_neighbours_show_in_what_the_registration_leaves() -> None:
+    """A window of 9 px and lines makes errors up to three times as large, and remembers them for 4.5 lines."""
     profile, columns = reference()
     lines = samples_of(matched(rendered(STILL, FLAWLESS)[1])).on(columns)
     found = register(lines, torch.zeros(len(lines.z), 3).double(), profile, frame(), CONFIG)
-    root = torch.linalg.cholesky(found.covariance)
-    data = NoisyValues(found.values, root, torch.ones(len(root), dtype=torch.bool))
-    errors, common = (LineErrors.of(found, data, common_mm) for common_mm in (0.0, 0.5))
-    assert ((errors.scale > 1.2) & (errors.scale < 4.5)).all()  # a window of 9 px makes it 3 at most
-    assert ((errors.memory > 2.0) & (errors.memory < 9.0)).all()  # of 9 lines
-    torch.testing.assert_close(errors.rms, found.values.std(0), rtol=0.35, atol=0)
+    errors, common = (LineErrors.of(sums_of(lines, found.values), common_mm) for common_mm in (0.0, 0.5))
+    assert ((errors.scale > 2.0) & (errors.scale < 3.4)).all()
+    assert ((errors.memory > 3.5) & (errors.memory < 5.5)).all()
+    torch.testing.assert_close(errors.rms, found.values.std(0), rtol=0.25, atol=0)
     assert float(common.rms[1]) == pytest.approx(math.hypot(0.5, float(errors.rms[1])))
     assert torch.equal(common.rms[[0, 2]], errors.rms[[0, 2]])
+
+
+def test_errors_of_independent_samples_are_as_stated() -> None:
+    profile, columns = reference()
+    depth = rendered(STILL, FLAWLESS)[1]
+    generator = torch.Generator().manual_seed(3)
+    lines = samples_of(depth + SIGMA_MM * torch.randn(depth.shape, generator=generator)).on(columns)
+    found = register(lines, torch.zeros(len(depth), 3).double(), profile, frame(), CONFIG)
+    errors = LineErrors.of(sums_of(lines, found.values), 0.0)
+    torch.testing.assert_close(errors.scale, torch.ones(3).double(), rtol=0.15, atol=0)
+    assert (errors.memory < 0.7).all()
+
+
+def test_sums_of_parts_are_those_of_all_lines() -> None:
+    profile, columns = reference()
+    lines = samples_of(matched(rendered(SHAKEN, FLAWLESS)[1])).on(columns)
+    found = register(lines, torch.zeros(len(lines.z), 3).double(), profile, frame(), CONFIG)
+    whole = sums_of(lines, found.values)
+    total = ErrorSums.total([sums_of(*part) for part in zip(lines.split(150), found.values.split(150), strict=True)])
+    for name in ("products", "pairs", "sensitivity"):
+        torch.testing.assert_close(getattr(total, name), getattr(whole, name))
+    torch.testing.assert_close(total.lasting[0], whole.lasting[0])
+    assert total.lasting_pairs[50].sum() < whole.lasting_pairs[50].sum()
 
 
 def test_reference_of_nothing() -> None:
