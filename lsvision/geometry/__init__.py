@@ -24,6 +24,7 @@ from lsvision.geometry.camera import (
     zero_disparity_mm,
 )
 from lsvision.geometry.color_rows import color_rows, color_shift, registered_rows
+from lsvision.geometry.ideal_rig import ideal_rig, is_rectified, scaled_raw_rig
 from lsvision.geometry.line_motion import (
     LineAxes,
     line_axes,
@@ -44,7 +45,7 @@ from lsvision.geometry.product_axes import (
     to_product,
 )
 from lsvision.geometry.raw_pair import LineCamera, Met, RawPair, Seen, quantities_of, with_quantities
-from lsvision.geometry.rectification import Rectification, RowShear, ideal_rig, is_rectified, scaled_raw_rig
+from lsvision.geometry.rectification import Rectification, RowShear
 from lsvision.geometry.rigid import (
     euler_angles,
     fit_rigid,

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from lsvision.geometry import ProductFrame, color_rows, color_shift
+from lsvision.geometry import ProductFrame, Rectification, color_rows, color_shift
 from lsvision.image.stereo.relation import PairRelation
 from lsvision.types import LineImage, Scan, StereoPair
 
@@ -58,7 +58,12 @@ class ColorPair:
 
 
 def color_pair(scan: Scan, frame: ProductFrame, relation: PairRelation | None) -> ColorPair | None:
-    """The two colours of a scan that look furthest apart; None where all look at one line, or nothing was matched."""
+    """The two colours of a scan that look furthest apart; None where all look at one line, or nothing was matched.
+
+    Nor are there any of a raw pair: its images show a column of the ideal pair elsewhere, and at another moment.
+    """
+    if Rectification.of(scan.raw_rig) is not None:
+        return None
     shift = color_shift(scan)
     if shift is None or relation is None or not isinstance(scan.images, StereoPair):
         return None
