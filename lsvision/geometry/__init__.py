@@ -9,6 +9,7 @@ from lsvision.geometry.camera import (
     depth_map_jacobian,
     depth_sigma,
     depth_step_mm,
+    disparity_at,
     disparity_at_height,
     focal_length_px,
     middle_point,
@@ -22,6 +23,7 @@ from lsvision.geometry.camera import (
     triangulation_jacobian,
     zero_disparity_mm,
 )
+from lsvision.geometry.color_rows import color_rows, color_shift, registered_rows
 from lsvision.geometry.line_motion import (
     LineAxes,
     line_axes,
@@ -66,10 +68,13 @@ __all__ = [
     "Seen",
     "aligned_rotation",
     "camera_center_mm",
+    "color_rows",
+    "color_shift",
     "depth_at",
     "depth_map_jacobian",
     "depth_sigma",
     "depth_step_mm",
+    "disparity_at",
     "disparity_at_height",
     "displace",
     "euler_angles",
@@ -88,6 +93,7 @@ __all__ = [
     "product_pose",
     "project",
     "quantities_of",
+    "registered_rows",
     "rotation_from_vector",
     "scaled_rig",
     "scan_position",

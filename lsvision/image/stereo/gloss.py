@@ -10,6 +10,7 @@ details that light does not have, ``proven_by_detail``.
 from dataclasses import dataclass
 
 import cv2
+import numpy as np
 import torch
 import torch.nn.functional as F  # noqa: N812
 from jaxtyping import Bool, Float, Shaped
@@ -23,7 +24,7 @@ from lsvision.image.tiling import HaloRange, halo_ranges, in_parallel
 
 _PATCH, _PATCH_SHARE = 5, 0.7  # px; unusable samples this dense are a saturated area, others are noise near white
 _SATURATED_SHARE = 0.002  # of the pixels of an image
-_SAMPLED, _MEAN_PX = 16, 9  # every so many lines are compared, by means over so many columns
+_SAMPLED, _MEAN_PX = 32, 9  # every so many lines are compared, by means over so many columns
 _OTHER_LIGHT, _OTHER_SHARE = 8.0, 0.1  # difference of grey values, of 255, and the share of the matched pixels
 _TILE_LINES = 256  # stay in the processor's cache
 _APART = 4  # lines over which details along the scan are differences
@@ -58,8 +59,8 @@ def light_is_suspect(
 
 def _saturated_share(unusable: Bool[Tensor, "lines width"] | None) -> float:
     """Share of the pixels that lie in saturated areas."""
-    if unusable is None:
-        return 0.0
+    if unusable is None or np.count_nonzero(unusable.numpy()) <= _SATURATED_SHARE * unusable.numel():
+        return 0.0  # without a look at where they are
     density = cv2.blur(unusable.to(torch.uint8).mul_(255).numpy(), (_PATCH, _PATCH))
     return float((density > 255 * _PATCH_SHARE).mean())
 

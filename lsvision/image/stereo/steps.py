@@ -128,10 +128,12 @@ def _extreme(
 
     Beyond the first and the last line the surface may be what it is beside a place on that line.
     """
-    extreme, rows = cv2.erode if lower else cv2.dilate, len(around) // 2
-    beside = np.ones((1, 2 * (_BESIDE_PX // block) + 1), np.uint8)
-    first, last = (np.asarray(extreme(line, beside)).repeat(rows, 0) for line in (surface[:1], surface[-1:]))
-    return np.asarray(extreme(np.concatenate([first, surface, last]), around))[rows : rows + len(surface)]
+    extreme, nearer = (cv2.erode, np.minimum) if lower else (cv2.dilate, np.maximum)
+    found, rows = np.asarray(extreme(surface, around)), len(around) // 2
+    beside = np.ones((1, around.shape[1] + 2 * (_BESIDE_PX // block)), np.uint8)
+    for near_end, line in ((found[:rows], surface[:1]), (found[-rows:], surface[-1:])):
+        nearer(near_end, extreme(line, beside), out=near_end)
+    return found
 
 
 @dataclass(frozen=True)
@@ -203,8 +205,8 @@ class _Match:
     def _refuted(self, squared: Tensor, other: NDArray[np.float32]) -> NDArray[np.bool_]:
         """Where the other side fits as well as noise allows, and much better, from its residuals."""
         size = (max(_REFUTED_WINDOW_PX // block_side(self.left, self.own), 1),) * 2
-        misfit = np.asarray(cv2.blur((squared / self.noise).numpy(), size))
-        return (cv2.boxFilter(other, -1, size, normalize=False) < _REFUTED) & (misfit < _FITS)
+        fits = cv2.blur(squared.numpy(), size) < self.noise.mul(_FITS).numpy()
+        return (cv2.boxFilter(other, -1, size, normalize=False) < _REFUTED) & fits
 
     def _log_likelihood(self, squared: Tensor) -> NDArray[np.float32]:
         """That of the disparities over that of others, whose residuals are given."""

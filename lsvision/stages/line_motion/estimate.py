@@ -31,10 +31,11 @@ from lsvision.stages.line_motion.register import Registered
 from lsvision.types import LINE_COMPONENTS, LineFinding, LineMotion
 
 _LEAST_LINES = 64  # measured; with fewer, motion and errors cannot be separated
-_FIT_SAMPLES, _FIT_SEQUENCES = 256, 4  # that the likelihood is taken of
+_FIT_SAMPLES, _FIT_SEQUENCES = 128, 8  # that the likelihood is taken of
 _USUAL_STATES, _OTHER_STATES = 2, (1, 3)
 _USUAL_LENGTH = 60.0  # lines
 _SPREADS = {"sigma": 2.5, "length": 1.5, "noise_scale": 0.7, "memory": 0.7}  # of the logarithms beforehand
+_EVIDENCE_STEPS = 4
 _NOTHING = 1e-3  # of the errors of a line: a component that is not there
 _OBSERVED = 2.0  # errors of a line over what a component usually amounts to, at most
 _SPIKE_SIGMA, _SPIKE_LINES = 8.0, 9
@@ -61,7 +62,7 @@ def estimate(
         usual_samples: how many samples of a line take part where nothing is missing.
         along_mm: travel of the lines. errors: of single lines.
     """
-    data = _noisy_values(lines, usual_samples, config)
+    data = noisy_values(lines, usual_samples, config)
     count = len(data.values)
     needed = max(_LEAST_LINES, math.ceil(config.min_share * count))
     if int(data.valid.sum()) < needed:
@@ -93,7 +94,7 @@ def _without_the_others(mean: Tensor, covariance: Tensor, kept: Tensor) -> tuple
     return (mean - left) * kept, covariance + left[:, :, None] * left[:, None]
 
 
-def _noisy_values(lines: Registered, usual_samples: int, config: LineMotionConfig) -> NoisyValues:
+def noisy_values(lines: Registered, usual_samples: int, config: LineMotionConfig) -> NoisyValues:
     """Values of lines, measured where enough samples took part and the line is no spike among its neighbours."""
     root = torch.linalg.cholesky(lines.covariance)
     valid = (lines.samples >= max(1.0, config.min_share * usual_samples)) & lines.values.isfinite().all(1)
@@ -194,7 +195,10 @@ def _without(
     sigma[index] = _NOTHING * noise[index]
     free = free.clone()
     free[:, index] = free.new_tensor([0.0, 0.0, 1.0, 1.0])
-    found = fit_signals(replace(fit.parameters, sigma=sigma), sequences, log_prior, free.flatten(), iterations=6)
+    scale = fit.parameters.noise_scale.clone()
+    scale[index] *= torch.hypot(noise[index], large[index]) / noise[index]
+    start = replace(fit.parameters, sigma=sigma, noise_scale=scale)
+    found = fit_signals(start, sequences, log_prior, free.flatten(), iterations=_EVIDENCE_STEPS)
     # That the prior finds a sigma of nothing unlikely is no evidence.
     back = replace(found.parameters, sigma=fit.parameters.sigma)
     return found.log_density - float(log_prior(_as_batch(found.parameters)) - log_prior(_as_batch(back)))
