@@ -10,7 +10,7 @@ Source: Rao 1971, Estimation of variance and covariance components - MINQUE theo
 
 import itertools
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float
@@ -56,6 +56,12 @@ class Residuals:
         return Residuals(
             self.residual[fits], self.weight[fits], self.jacobian[fits], self.influence[fits], self.corner[fits]
         )
+
+    def without(self, difference: Float[Tensor, "fits pixels"]) -> "Residuals":
+        """What fits would have left of windows without a difference from the model."""
+        taken = torch.linalg.qr(self.jacobian.mT).Q
+        left = difference[:, None] - (difference[:, None] @ taken) @ taken.mT
+        return replace(self, residual=self.residual - left[:, 0])
 
     def cropped(self, size: int) -> "Residuals":
         """The middle of the windows."""
@@ -119,10 +125,16 @@ class Correlation:
 
 @dataclass(frozen=True)
 class BoardNoise:
-    """What the fits of a board have left of its windows, and the variance of each kind of noise in it."""
+    """What the fits of a board have left of its windows, and the variance of each kind of noise in it.
+
+    Of the variance of the noise on edges, the share ``surviving`` is left after the mean along an edge. ``aliased``,
+    px², is the covariance of moves that depend on where a corner lies between the pixels (``edge_profile``).
+    """
 
     residuals: Residuals
     strength: Float[Tensor, " kinds"]
+    surviving: float = 1.0
+    aliased: Float[Tensor, "2 2"] | float = 0.0
 
     @classmethod
     def of(cls, residuals: Residuals, valid: Bool[Tensor, " fits"]) -> "BoardNoise":
@@ -133,7 +145,9 @@ class BoardNoise:
     def covariance(self, fits: Bool[Tensor, " fits"]) -> Float[Tensor, "some 2 2"]:
         """Covariance of the errors of some corners, px²."""
         residuals = self.residuals.of(fits)
-        return corner_covariance(residuals, residuals, self.strength)
+        strength = self.strength.clone()
+        strength[-1] *= self.surviving
+        return corner_covariance(residuals, residuals, strength) + self.aliased
 
     def covariance_with(self, other: "BoardNoise", fits: Bool[Tensor, " fits"]) -> Float[Tensor, "some 2 2"]:
         """Covariance, px², of the errors of some corners with those of the same corners in another image.
@@ -169,17 +183,12 @@ def corner_covariance(
 ) -> Float[Tensor, "fits 2 2"]:
     """Covariance of the errors of corners in one image with those of the same corners in another, px².
 
-    An undersampled or sharpened edge is off by another amount at every pixel. These errors are spread evenly along the
-    edge and cancel, but for about one pixel's at either end of the window: that share of their variance remains.
-
     Args:
         first, second: fits of the same corners in windows of one size; the same for the covariance within an image.
         strength: variance of each kind of noise.
     """
-    remaining = strength.clone()
-    remaining[-1] *= 2 / first.size
     moved = Correlation.between(first, second, torch.float32).times(second.influence.float()).to(first.residual)
-    return torch.einsum("k, fip, kfjp -> fij", remaining, first.influence, moved)
+    return torch.einsum("k, fip, kfjp -> fij", strength, first.influence, moved)
 
 
 def _of_one_size(first: Residuals, second: Residuals) -> tuple[Residuals, Residuals]:

@@ -36,13 +36,17 @@ class Windows:
         cls, pixels: Float[Tensor, "corners size size"], mask: Bool[Tensor, "corners size size"]
     ) -> "Windows":
         """Windows of odd size, of which the mask's pixels are fitted."""
-        size = pixels.shape[-1]
-        axis = torch.arange(size, dtype=pixels.dtype, device=pixels.device) - (size - 1) / 2
-        grid = torch.stack(torch.meshgrid(axis, axis, indexing="xy")).flatten(1)
+        grid = pixel_grid(pixels.shape[-1], pixels)
         complete = torch.isfinite(pixels).flatten(1).all(-1)
         weight = mask.to(pixels.dtype).flatten(1)
         values = torch.where(complete[:, None], pixels.flatten(1), 0.0) * weight
         return cls(values, weight, grid, complete)
+
+
+def pixel_grid(size: int, like: Tensor) -> Float[Tensor, "2 pixels"]:
+    """(u, v) of the pixels of a square window from its centre, px."""
+    axis = torch.arange(size, dtype=like.dtype, device=like.device) - (size - 1) / 2
+    return torch.stack(torch.meshgrid(axis, axis, indexing="xy")).flatten(1)
 
 
 @dataclass(frozen=True)

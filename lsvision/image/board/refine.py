@@ -7,6 +7,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from lsvision.image.board.correlated_noise import BoardNoise, possible_covariance
+from lsvision.image.board.edge_profile import board_noise
 from lsvision.image.board.outliers import evenly_clipped, in_line_with_neighbours, like_the_board
 from lsvision.image.board.saddle import SaddleOptions, fit_saddles
 from lsvision.image.brightness import gray
@@ -102,7 +103,7 @@ def refine_grid(
     if plain:
         covariance[valid] = fit.covariance[valid]
     elif bool(valid.any()):
-        noise = BoardNoise.of(fit.residuals, valid)
+        noise = board_noise(fit, valid)
         covariance[valid] = noise.covariance(valid) + _MODEL_PX**2 * torch.eye(2).to(windows)
     position = torch.where(valid[:, None], centre + fit.position, torch.nan)
     return DetectedCorners(position, covariance, valid, noise)

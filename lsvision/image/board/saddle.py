@@ -9,7 +9,13 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from lsvision.image.board.correlated_noise import Residuals
-from lsvision.image.board.levenberg_marquardt import Linearisation, NormalMatrix, Windows, fit_parameters
+from lsvision.image.board.levenberg_marquardt import (
+    Linearisation,
+    NormalMatrix,
+    Windows,
+    fit_parameters,
+    pixel_grid,
+)
 from lsvision.image.board.saddle_model import (
     FULL,
     PARAMETERS,
@@ -30,17 +36,29 @@ _SMALLEST_CROSSING = 0.2  # sine of the angle between edges: nearly parallel one
 class SaddleFit:
     """Fitted corners: ``position (corners, 2)`` as (u, v) px from the window's centre, and whether each is a corner.
 
-    ``covariance``, px², is that of independent noise in the pixels; where it is correlated, as a surface's texture is,
+    ``misfit`` is the window less the fitted saddle, 0 at pixels that are not fitted. ``covariance``, px², is that of
+    independent noise in the pixels; where it is correlated, as a surface's texture is,
     ``correlated_noise.corner_covariance`` finds the covariance from the ``residuals`` of a board's fits.
     """
 
     position: Float[Tensor, "corners 2"]
     covariance: Float[Tensor, "corners 2 2"]
     residuals: Residuals
+    parameters: SaddleParameters
+    misfit: Float[Tensor, "corners pixels"]
     blur_px: Float[Tensor, " corners"]
     contrast: Float[Tensor, " corners"]
     residual: Float[Tensor, " corners"]
     valid: Bool[Tensor, " corners"]
+
+    @property
+    def grid(self) -> Float[Tensor, "2 pixels"]:
+        """(u, v) of the pixels of the windows from their centres, px."""
+        return pixel_grid(self.residuals.size, self.misfit)
+
+    def saddles(self, corners: Bool[Tensor, " corners"]) -> Saddle:
+        """The fitted saddles of some corners."""
+        return Saddle.on_grid(SaddleParameters(self.parameters.columns[corners]), self.grid)
 
 
 @dataclass(frozen=True)
@@ -87,7 +105,7 @@ def fit_saddles(
 def _joined(kind: type, parts: Sequence[Any]) -> Any:
     """Fits of several parts as one, field by field."""
     values = ([getattr(part, item.name) for part in parts] for item in fields(kind))
-    return kind(*(torch.cat(value) if isinstance(value[0], Tensor) else _joined(Residuals, value) for value in values))
+    return kind(*(torch.cat(v) if isinstance(v[0], Tensor) else _joined(type(v[0]), v) for v in values))
 
 
 def _fit_together(windows: Windows, angles: Tensor, options: SaddleOptions) -> SaddleFit:
@@ -105,6 +123,8 @@ def _fit_together(windows: Windows, angles: Tensor, options: SaddleOptions) -> S
         position=parameters.position,
         covariance=inverse_normal[:, POSITION, POSITION] * variance[:, None, None],
         residuals=residuals if options.plain else _without_other_shapes(windows, parameters, residuals),
+        parameters=parameters,
+        misfit=fitted.residual,
         blur_px=(parameters.blur.square() + PIXEL_VARIANCE).sqrt(),
         contrast=parameters.contrast.abs(),
         residual=variance.sqrt(),

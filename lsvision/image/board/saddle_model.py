@@ -172,11 +172,16 @@ class Saddle:
         """Grey values."""
         return (self.levels * self.shapes).sum(1)
 
+    def steps(self) -> Float[Tensor, "corners 2 pixels"]:
+        """Half the change of the grey values across either edge."""
+        first, second = self.edges
+        _, a1, a2, a3 = self.levels.unbind(1)
+        return torch.stack([a1 + a3 * second.value, a2 + a3 * first.value], dim=1)
+
     def jacobian(self, model: SaddleModel) -> Float[Tensor, "corners free pixels"]:
         """Derivative of the grey values by the free parameters of a model."""
         first, second = self.edges
-        _, a1, a2, a3 = self.levels.unbind(1)
-        weight_1, weight_2 = a1 + a3 * second.value, a2 + a3 * first.value  # of a change of either edge
+        weight_1, weight_2 = self.steps().unbind(1)
         slope_1, slope_2 = weight_1 * first.slope, weight_2 * second.slope
         by_shape = [
             -(slope_1 * first.normal[0] + slope_2 * second.normal[0]),
@@ -195,8 +200,7 @@ class Saddle:
         one edge than across the other, and blurs that are no bell.
         """
         first, second = self.edges
-        _, a1, a2, a3 = self.levels.unbind(1)
-        weight_1, weight_2 = a1 + a3 * second.value, a2 + a3 * first.value
+        weight_1, weight_2 = self.steps().unbind(1)
         values = self.values()
         centred = values - values.mean(-1, keepdim=True)
         return torch.stack(

@@ -42,7 +42,8 @@ def test_corners_of_another_renderer(shared_data: Path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("noise", "contrast", "blur"), [(1.0, 1.0, 0.0), (2.0, 0.3, 0.0), (2.0, 1.0, 1.0), (2.0, 1.0, 2.0)]
+    ("noise", "contrast", "blur"),
+    [(1.0, 1.0, 0.0), (2.0, 0.3, 0.0), (2.0, 1.0, 0.4), (2.0, 1.0, 0.7), (2.0, 1.0, 1.0), (2.0, 1.0, 2.0)],
 )
 def test_chi_square_of_the_points_of_another_renderer(shared_data: Path, noise, contrast, blur):
     squared = []
