@@ -60,7 +60,8 @@ class LineMotion:
 
     On line v the object is displaced by (δx, 0, δz) mm and turned by the roll ρ (rad) about Y through c = (B/2, 0, z0);
     δy, mm, is added to the nominal travel of the line. The mean and the linear trend over the travel are zero where the
-    motion was estimated: they belong to the pose of the object and to n.
+    motion was estimated from its scan alone: they belong to the pose of the object and to n. Where n comes from several
+    scans, as in a calibration, the trend by which a scan departs from it stays; its uncertainty is part of n's.
 
     Attributes:
         values: (δx, δz, ρ, δy) by line, float64; zero for a component that is not corrected.

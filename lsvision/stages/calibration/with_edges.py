@@ -27,7 +27,7 @@ from lsvision.stages.calibration.along_scan import (
 )
 from lsvision.stages.calibration.along_scan.kernels import wave_length
 from lsvision.stages.calibration.along_scan.lines import Travel
-from lsvision.stages.calibration.model import residuals_in_sigmas
+from lsvision.stages.calibration.model import refitted, residuals_in_sigmas
 from lsvision.stages.calibration.problem import BoardProblem
 from lsvision.stages.calibration.solution import estimate_white
 from lsvision.stages.calibration.solved import Solution
@@ -45,7 +45,7 @@ def with_edges(solution: Solution, edges: Sequence[BoardEdges | None]) -> Soluti
     Returns:
         The given one where no edges were found.
     """
-    rows = edge_rows(solution.problem, solution.posterior.mean, edges)
+    rows = edge_rows(solution.problem, refitted(solution.problem, solution.posterior.mean), edges)
     if not rows.values:
         return solution
     scale = torch.full_like(solution.noise_scale, _DOUBTED)
@@ -63,7 +63,8 @@ def _estimated(solution: Solution, edges: EdgeRows) -> Solution:
     """A solution once more, with edges: its errors along the scan are where the search for them starts from."""
     config = solution.config
     problem = solution.problem.scaled(solution.noise_scale)
-    linearised = Linearised.of(problem, solution.posterior.mean, config.prior_sigma)
+    # About poses that leave the least residuals: those of the posterior are off by what long waves are.
+    linearised = Linearised.of(problem, refitted(problem, solution.posterior.mean), config.prior_sigma)
     errors = search_with_edges(
         problem, linearised, edges, None if solution.edges is None else solution.along_scan.variances
     )

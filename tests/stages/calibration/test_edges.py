@@ -85,6 +85,24 @@ def test_rows_vanish_at_the_true_map_but_for_the_noise():
     torch.testing.assert_close(rows.sigma_px[:, 1], torch.full((2,), DISPARITY_SIGMA).double(), rtol=0.1, atol=0)
 
 
+def test_edges_beyond_the_corners_that_were_used_do_not_count():
+    corners, motion = shaken_boards(1, TWO_TILTS)
+    valid = corners.valid.clone()
+    valid[0, :11] = False  # a whole row
+    fewer = dataclasses.replace(corners, valid=valid)
+    edges = edges_of(corners, motion)
+    problem, state = at_truth(fewer)
+    first = problem.points[0, valid[0], 1].min()
+    within = edges[0].points[:, 1] >= first
+    assert not bool(within.all())
+    kept = {name: getattr(edges[0], name)[within] for name in ("points", "by_column", "sigma_px", "start", "stop")}
+    kept |= {name: getattr(edges[0], name)[within] for name in ("segment", "line")}
+    all_rows, some_rows = (
+        edge_rows(problem, state, [edge, edges[1]]).rows for edge in (edges[0], dataclasses.replace(edges[0], **kept))
+    )
+    torch.testing.assert_close(all_rows.mT @ all_rows, some_rows.mT @ some_rows, rtol=1e-6, atol=1e-3)
+
+
 def test_edges_far_off_their_board_do_not_count():
     corners, motion = shaken_boards(2, TWO_TILTS)
     problem, state = at_truth(corners)

@@ -4,10 +4,12 @@ Corners alone leave several kernels possible, and the search averages over them.
 is: a sum of a few waves. Then the variances of all kernels are those of the greatest restricted likelihood: each is
 multiplied, again and again, by how much its process shows over how much it should,
 
-    v_k <- v_k √(Σ αᵀ K_k α / Σ tr(K_k P)),
+    v_k <- v_k √(Σ αᵀ K_k α / (Σ tr(K_k P) + 2 / s²)),
 
 P the precision of the data at the knots with poses and n projected out, α what it makes of the data, the sums over all
-boards. No step lowers the likelihood, and none leaves the range. It needs no start: all begin alike.
+boards. A variance is exponentially distributed beforehand, its mean s² that of the residuals: long waves, many times
+larger, could stand for any n otherwise. No step lowers the posterior density, and none leaves the range. It needs no
+start: all begin alike.
 
 A variance that follows from few squares, of a wave that each board shows once, may well be larger: v_k Σ tr(K_k P) is
 their number ν, and ν / (ν - 2) the mean of what is probable over what is most probable.
@@ -32,6 +34,7 @@ _STEPS, _STEPS_NEARBY = 60, 30
 _STIRRED = 1e-3  # of what the residuals show, to begin with: a kernel without any would stay without
 _CAREFUL = 20  # steps with the root; later ones go twice as far
 _FEWEST_SQUARES = 4.0  # that a variance counts as known by
+_LEAST_MM = 1e-6  # of what the residuals show
 _NOTHING = 1e-12  # of a component's variance
 
 
@@ -45,14 +48,15 @@ def search_with_edges(
     """
     equations = NormalEquations.of(problem, linearised, FINE, edges)
     correlation = kernel_family(FINE).covariance.to(equations.state)
-    variances = (equations.rms_mm.square()[:, None] / len(correlation)).expand(-1, len(correlation))
+    usual = equations.rms_mm.square()[:, None].clamp(min=_LEAST_MM**2)
+    variances = (usual / len(correlation)).expand(-1, len(correlation))
     if near is not None:
         variances = near + _STIRRED * variances
     for step in range(_STEPS if near is None else _STEPS_NEARBY):
         data = _Projected.of(equations, torch.tensordot(variances, correlation, 1))
         shown = torch.einsum("bci,kij,bcj->ck", data.weighed, correlation, data.weighed)
         expected = torch.einsum("kij,bcij->ck", correlation, data.precision)
-        ratio = (shown / expected).clamp(0.0, 1e3)
+        ratio = (shown / (expected + 2.0 / usual)).clamp(0.0, 1e3)
         variances = variances * (ratio.sqrt() if step < _CAREFUL else ratio)
     squares = (variances * expected).clamp(min=_FEWEST_SQUARES)
     variances = variances * squares / (squares - 2.0)

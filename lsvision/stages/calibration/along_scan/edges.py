@@ -103,15 +103,16 @@ class _Crossings:
         whitener[:, 0, 0] = whitener[:, 1, 2] = 1.0
         whitener[:, :, 1] = -edge[:, ::2] / edge[:, 1:2]
         whitener = torch.linalg.solve(found.by_column, whitener) / found.sigma_px[:, None, None]
-        lever = Lever.of(problem)
+        lever, place = Lever.of(problem), (y - travel.start_mm[board]) / travel.extent_mm
         one = replace(lever, middle=lever.middle[board : board + 1])
         return cls(
             found=found,
             whitener=whitener,
             by_component=whitener @ one.directions(found.points[None])[0].mT,
-            place=(y - travel.start_mm[board]) / travel.extent_mm,
+            place=place,
             features=affine_features(body),
-            kept=torch.isfinite(whitener).all((-2, -1)),
+            # The knots end where the corners do that were used.
+            kept=torch.isfinite(whitener).all((-2, -1)) & (place >= 0.0) & (place <= 1.0),
         )
 
     def without_outliers(self) -> "_Crossings":
