@@ -185,7 +185,7 @@ def line_motion_metadata(motion: LineMotion, origin: Origin, travel: Travel) -> 
     """What is known about a motion, as plain data: its source, its components, and what may be shape instead."""
     lines = torch.arange(motion.lines, dtype=torch.float64)
     advance = float(travel_at(travel, lines).diff().abs().mean())
-    band = band_of_power(motion.values, advance) if origin == "measured" else None
+    band = ambiguous_band(motion, advance) if origin == "measured" else None
     return {
         "source": origin,
         "advance_mm": advance,
@@ -194,6 +194,16 @@ def line_motion_metadata(motion: LineMotion, origin: Origin, travel: Travel) -> 
         "ambiguous_wavelengths_mm": list(band) if band else None,
         "note": ambiguity_in_words(band) if band else "",
     }
+
+
+def ambiguous_band(motion: LineMotion, advance_mm: float) -> tuple[float, float] | None:
+    """Shortest and longest wavelength, mm, of a motion that may be shape: none that the colours' lines have told."""
+    bands = []
+    for index, finding in enumerate(motion.findings):
+        band, told = band_of_power(motion.values[:, [index]], advance_mm), finding.told_up_to_mm or 0.0
+        if finding.component != "dy" and band is not None and band[1] > told:
+            bands.append((max(band[0], told), band[1]))
+    return (min(band[0] for band in bands), max(band[1] for band in bands)) if bands else None
 
 
 def ambiguity_in_words(band: tuple[float, float]) -> str:

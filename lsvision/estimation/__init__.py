@@ -1,11 +1,12 @@
 """Estimation of Gaussian states: cubature regression, square-root filters, joint update, least squares, information.
 
 The calibration uses ``iterated_update``, ``filter_sequence``, ``levenberg_marquardt``, ``slr`` and the information of a
-posterior; the motion from line to line uses ``fit_signals`` and ``smooth_signals``, and with them ``matern``. The rest
+posterior; the motion from line to line uses ``fit_signals`` and ``smooth_signals``, and with them ``matern``; to tell
+it from the object's shape, ``fit_shares`` and ``smooth_shares``, and with them ``oscillation`` and ``smooth``. The rest
 is library API for other models, which the package itself does not call: ``measurement`` and ``whitened_rows`` for the
-joint update, ``predict`` and ``update`` for filters, ``smooth`` and ``filter_signals`` in square-root form,
-``oscillation`` for resonances, ``recentre`` for rotations in a state, ``nis``, ``fisher_information`` and
-``marginal_information`` for checks. ``linalg`` holds the matrix functions that all of them use, and the rule on bits.
+joint update, ``predict`` and ``update`` for filters, ``filter_signals`` in square-root form, ``recentre`` for rotations
+in a state, ``nis``, ``fisher_information`` and ``marginal_information`` for checks. ``linalg`` holds the matrix
+functions that all of them use, and the rule on bits.
 """
 
 from lsvision.estimation.consistency import chi_square_tail, mean_chi_square_band, nees, nis
@@ -24,6 +25,9 @@ from lsvision.estimation.joint import Info, Linearise, Posterior, Rows, iterated
 from lsvision.estimation.least_squares import LeastSquares, levenberg_marquardt
 from lsvision.estimation.linalg import apply, lower_factor, product, solve_upper, upper_root
 from lsvision.estimation.rotation import recentre
+from lsvision.estimation.shared_parts import Part
+from lsvision.estimation.shared_signal import SharedModel, SharedSignal, smooth_shares
+from lsvision.estimation.shared_waves import SharedFit, fit_shares
 from lsvision.estimation.signal_fit import SignalFit, SignalParameters, fit_signals, log_likelihood
 from lsvision.estimation.signals import NoisyValues, SignalModel, filter_signals, smooth_signals
 from lsvision.estimation.smoothing import smooth
@@ -38,10 +42,14 @@ __all__ = [
     "LeastSquares",
     "Linearise",
     "NoisyValues",
+    "Part",
     "Posterior",
     "Prior",
     "Process",
     "Rows",
+    "SharedFit",
+    "SharedModel",
+    "SharedSignal",
     "SignalFit",
     "SignalModel",
     "SignalParameters",
@@ -54,6 +62,7 @@ __all__ = [
     "filter_sequence",
     "filter_signals",
     "fisher_information",
+    "fit_shares",
     "fit_signals",
     "iterated_update",
     "jacobian",
@@ -73,6 +82,7 @@ __all__ = [
     "recentre",
     "slr",
     "smooth",
+    "smooth_shares",
     "smooth_signals",
     "solve_upper",
     "update",

@@ -8,13 +8,14 @@ from pathlib import Path
 from lsvision import __version__
 from lsvision.errors import CalibrationError, ConfigError, UnusableCalibrationError
 from lsvision.experiments.settings import RunSettings, settings_sha256
-from lsvision.io import read_scan, scan_sha256, write_calibration, write_json
+from lsvision.io import read_scan, scan_sha256, write_calibration, write_json, write_line_motion
 from lsvision.report import calibration_report, calibration_summary
 from lsvision.report.progress import progress_bars
 from lsvision.schema import Text
 from lsvision.stages.calibration.calibrate import calibrate
 from lsvision.stages.calibration.config import CalibrationConfig
 from lsvision.stages.corners.config import CornersConfig
+from lsvision.stages.corners.edges import find_edges
 from lsvision.stages.corners.find import find_corners
 from lsvision.stages.corners.rows import row_difference
 from lsvision.types import Board, BoardCorners, Calibration, MissingLines, Provenance, Scan
@@ -46,20 +47,51 @@ def run_calibrate(settings: CalibrateSettings, folder: Path) -> None:
     """
     scans = read_scans(settings.scans, settings.missing_lines)
     boards = find_boards(scans, settings.board, settings.corners)
-    calibration = calibrate(boards, scans[0].rig, settings.calibration)
+    calibration = calibrate_with_edges(scans, boards, settings.board, settings.calibration)
     provenance = Provenance(
         version=__version__,
         config_sha256=settings_sha256(settings),
         scans=tuple((str(scan.path), scan_sha256(scan.path)) for scan in scans),
     )
-    calibration = replace(calibration, provenance=provenance)
     target = Path(settings.output) if settings.output else folder / "calibration.json"
+    calibration = write_line_motions(replace(calibration, provenance=provenance), target)
     write_calibration(calibration, target)
     write_json(folder / "summary.json", _summary(calibration))
     calibration_report(calibration, boards, asdict(settings), folder)
     log.info("%s\nwrote %s and %s", calibration_summary(calibration), target, folder / "report.html")
     if not calibration.usable:
         raise UnusableCalibrationError(str(target), calibration.verdict, calibration.reasons)
+
+
+def calibrate_with_edges(
+    scans: Sequence[Scan], boards: Sequence[BoardCorners], board: Board, config: CalibrationConfig
+) -> Calibration:
+    """Calibrate from the corners; where they show that the boards shook, from the edges on every line as well."""
+    calibration = calibrate(boards, scans[0].rig, config)
+    if not calibration.errors_along_scan or config.line_motion == "none":
+        return calibration
+    with progress_bars() as bars:
+        bar = bars.start("find edges", total=len(scans))
+        edges = []
+        for scan, corners in zip(scans, boards, strict=True):
+            edges.append(find_edges(scan, board, corners))
+            bars.advance(bar)
+    return calibrate(boards, scans[0].rig, config, edges)
+
+
+def write_line_motions(calibration: Calibration, target: Path) -> Calibration:
+    """Write the motion of every board's scan from line to line beside a calibration's file, which names them.
+
+    ``+experiment=correct line_motion=FILE`` takes each for its own scan.
+    """
+    if not calibration.line_motions:
+        return calibration
+    boards = []
+    for number, (board, motion) in enumerate(zip(calibration.boards, calibration.line_motions, strict=True), start=1):
+        name = f"{target.stem}_line_motion_{number}_{Path(board.scan).name}.parquet"
+        write_line_motion(motion, target.with_name(name))
+        boards.append(replace(board, line_motion_file=name))
+    return replace(calibration, boards=tuple(boards))
 
 
 def read_scans(paths: Sequence[str], missing_lines: MissingLines = "refuse") -> list[Scan]:
@@ -113,6 +145,11 @@ def _summary(calibration: Calibration) -> dict:
         "notes": list(calibration.notes),
         "noise_scale": calibration.noise_scale,
         "errors_along_scan": [asdict(error) for error in calibration.errors_along_scan],
+        "line_motion": {
+            board.line_motion_file: [finding.in_words for finding in board.line_motion]
+            for board in calibration.boards
+            if board.line_motion_file
+        },
         "n": calibration.motion.n.tolist(),
         "sigma": calibration.motion.sigma.tolist(),
         "stretch": calibration.motion.stretch,

@@ -6,6 +6,7 @@ both calibrations, and one board shaken as the paper's figures suggest is calibr
 """
 
 import logging
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Annotated
@@ -14,6 +15,7 @@ import torch
 from annotated_types import MinLen
 
 from lsvision.archive import Processing, plan_one
+from lsvision.experiments.calibrate import calibrate_with_edges
 from lsvision.experiments.correct import make_product
 from lsvision.experiments.parallel import map_names, scan_pool
 from lsvision.experiments.settings import RunSettings
@@ -36,7 +38,9 @@ from lsvision.simulation import (
 from lsvision.simulation.sheet_points import points_in_product, points_in_scan
 from lsvision.stages.calibration.calibrate import calibrate
 from lsvision.stages.calibration.config import CalibrationConfig
+from lsvision.stages.calibration.known_motion import calibrate_lines
 from lsvision.stages.corners.config import CornersConfig
+from lsvision.stages.corners.edges import find_edges
 from lsvision.stages.corners.find import find_corners
 from lsvision.stages.correction.config import CorrectionConfig
 from lsvision.stages.disparity.config import DisparityConfig
@@ -149,9 +153,13 @@ def _scenario(settings: PaperSettings, motion: MotionConfig, folder: Path, bars:
     def tried(result: Calibration) -> Trial:
         return Trial(result, n_true, fitted_rmse_mm(corners[HELD_OUT], result.motion.n))
 
+    trials = {"joint": tried(joint), "two_step": tried(two_step)}
+    if joint.errors_along_scan:
+        trials["joint with line motion"] = _with_line_motion(settings, scans, corners, n_true)
+        write_calibration(trials["joint with line motion"].result, folder / "calibration_line_motion.json")
     color, height = _in_memory(products["sheet"])
     return Scenario(
-        trials={"joint": tried(joint), "two_step": tried(two_step)},
+        trials=trials,
         held_out_before_mm=fitted_rmse_mm(corners[HELD_OUT], NOMINAL),
         boards=corners,
         checks=checks,
@@ -160,6 +168,23 @@ def _scenario(settings: PaperSettings, motion: MotionConfig, folder: Path, bars:
         scans=scans,
         products=products,
     )
+
+
+def _with_line_motion(
+    settings: PaperSettings, scans: Mapping[str, Scan], corners: Mapping[str, BoardCorners], n_true: torch.Tensor
+) -> Trial:
+    """The joint calibration of shaken boards with the motion of their lines.
+
+    The board that is held out is fitted under its n, with the motion of its own lines.
+    """
+    config = replace(settings.joint, line_motion="auto")
+    seen = [name for name in corners if name != HELD_OUT]
+    boards = [corners[name] for name in seen]
+    result = calibrate_with_edges([scans[name] for name in seen], boards, settings.board, config)
+    held_out = corners[HELD_OUT]
+    edges = find_edges(scans[HELD_OUT], settings.board, held_out)
+    own = calibrate_lines(held_out, edges, result.motion.n, scans[HELD_OUT].rig, config)
+    return Trial(result, n_true, own.rmse_after_mm)
 
 
 def _simulations(settings: PaperSettings, motion: MotionConfig) -> dict[str, Simulation]:

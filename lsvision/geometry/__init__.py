@@ -9,6 +9,7 @@ from lsvision.geometry.camera import (
     depth_map_jacobian,
     depth_sigma,
     depth_step_mm,
+    disparity_at,
     disparity_at_height,
     focal_length_px,
     middle_point,
@@ -22,6 +23,7 @@ from lsvision.geometry.camera import (
     triangulation_jacobian,
     zero_disparity_mm,
 )
+from lsvision.geometry.color_rows import color_rows, color_shift, registered_rows
 from lsvision.geometry.line_motion import (
     LineAxes,
     line_axes,
@@ -58,10 +60,13 @@ __all__ = [
     "ProductFrame",
     "aligned_rotation",
     "camera_center_mm",
+    "color_rows",
+    "color_shift",
     "depth_at",
     "depth_map_jacobian",
     "depth_sigma",
     "depth_step_mm",
+    "disparity_at",
     "disparity_at_height",
     "displace",
     "euler_angles",
@@ -77,6 +82,7 @@ __all__ = [
     "product_axes",
     "product_pose",
     "project",
+    "registered_rows",
     "rotation_from_vector",
     "scaled_rig",
     "scan_position",

@@ -102,6 +102,11 @@ def depth_at(rig: Rig, disparity_px: Float[Tensor, "*batch"]) -> Float[Tensor, "
     return (focal_length_px(rig) * rig.baseline_mm) / torch.where(convergence > 0, convergence, torch.nan)
 
 
+def disparity_at(rig: Rig, z: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+    """Disparity, px, of the points at a depth, mm: the inverse of ``depth_at``."""
+    return focal_length_px(rig) * rig.baseline_mm / z - (rig.principal_right_px - rig.principal_left_px)
+
+
 def disparity_at_height(rig: Rig, height_mm: float) -> float:
     """Disparity, px, of a depth that lies ``height_mm`` before the plane of zero disparity."""
     z0 = zero_disparity_mm(rig)

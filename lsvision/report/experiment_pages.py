@@ -6,6 +6,7 @@ from pathlib import Path
 import torch
 
 from lsvision.io import Product
+from lsvision.report.board_motion import board_motion_figures, board_motion_tables
 from lsvision.report.calibration_figures import (
     components_by_iteration,
     corner_positions,
@@ -58,7 +59,8 @@ def calibration_report(calibration: Calibration, boards: Sequence[BoardCorners],
                 rows,
                 "The last column is 1 where the residuals are as large as the corners' stated sigmas; over all boards "
                 f"the noise was scaled by {calibration.noise_scale:.3g}.",
-            )
+            ),
+            *board_motion_tables(calibration),
         ],
         figures=[
             rmse_by_iteration(curves),
@@ -70,6 +72,7 @@ def calibration_report(calibration: Calibration, boards: Sequence[BoardCorners],
                 corner_positions(board, calibration, name=f"corner_positions_{index}", label=Path(board.scan).name)
                 for index, board in enumerate(boards, start=1)
             ),
+            *board_motion_figures(calibration, boards),
         ],
         settings=settings,
         provenance={

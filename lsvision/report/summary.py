@@ -1,8 +1,9 @@
 """A calibration in plain words, for the terminal."""
 
 import math
+from pathlib import Path
 
-from lsvision.types import Calibration, Motion
+from lsvision.types import BoardFit, Calibration, Motion
 
 
 def calibration_summary(calibration: Calibration) -> str:
@@ -22,6 +23,7 @@ def calibration_summary(calibration: Calibration) -> str:
         f"  drift        {drift_in_words(motion)}",
     ]
     lines += [f"  allowed for  {error.in_words}" for error in calibration.errors_along_scan]
+    lines += [f"  lines of     {board_motion_in_words(board)}" for board in calibration.boards if board.line_motion]
     lines += [f"  because      {reason}" for reason in calibration.reasons if reason != observability.advice]
     lines += [f"  note         {note}" for note in calibration.notes]
     unknown = [direction for direction in observability.directions if not direction.observed]
@@ -33,6 +35,12 @@ def calibration_summary(calibration: Calibration) -> str:
     if observability.advice:
         lines.append(f"  next         {observability.advice}")
     return "\n".join(lines)
+
+
+def board_motion_in_words(board: BoardFit) -> str:
+    """The motion of a board's scan from line to line: the components that are there or may be."""
+    named = [finding.in_words for finding in board.line_motion if finding.state != "absent"]
+    return f"{Path(board.scan).name}: {'; '.join(named) or 'still'}"
 
 
 def drift_in_words(motion: Motion) -> str:

@@ -13,7 +13,9 @@ class SceneConfig(Checked):
     A board or sheet is turned by ``R = Rz(yaw) Ry(roll) Rx(pitch)`` about its centre, which crosses the scan plane
     midway between the cameras, ``depth_offset_mm`` behind the plane of zero disparity, on the middle line. A rail runs
     along the motion and can only roll about it; its crown has the height ``rail_rise_mm`` in the product frame, counted
-    from that depth. The conveyor is a plane along the motion at the height ``-conveyor_drop_mm``; any target hides it.
+    from that depth. A corrugated rail rises and falls by ``corrugation_mm`` in a wave of ``corrugation_wavelength_mm``,
+    whose phase is drawn from the seed and whose crests lie along the scan lines. The conveyor is a plane along the
+    motion at the height ``-conveyor_drop_mm``; any target hides it.
     """
 
     kind: Literal["board", "sheet", "rail"] = "board"
@@ -31,6 +33,8 @@ class SceneConfig(Checked):
     rail_length_mm: Positive = 400.0
     rail_rise_mm: float = 22.0  # of the crown over the plane of zero disparity
     rail_texture: NonNegative = 0.16
+    corrugation_mm: NonNegative = 0.0  # amplitude; 0: the same height all along
+    corrugation_wavelength_mm: Positive = 80.0
     defect_spacing_mm: NonNegative = 120.0  # one scratch and one pit per length of rail; 0: none
     roll_mark_period_mm: NonNegative = 150.0  # circumference of the damaged roll; 0: none
     conveyor_drop_mm: float = 26.0  # of the conveyor under the plane of zero disparity

@@ -1,17 +1,20 @@
 """A rail swept along the motion: profile, mill scale and defects, seen by rays in the plane of its profile.
 
 But for its defects a rail is the same all along its length, so the point that a ray meets first is found in the plane
-across it. The defects, a few tenths of a millimetre deep, then move that point along the ray.
+across it. The defects, a few tenths of a millimetre deep, then move that point along the ray. Corrugation lifts the
+whole profile that a line sees.
 """
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 
 import torch
+from torch import Tensor
 
 from lsvision.simulation.config import SceneConfig
 from lsvision.simulation.defects import defects
 from lsvision.simulation.lighting import Lighting
-from lsvision.simulation.noise import Nodes, Octave, Raster, covering, octaves, value_noise
+from lsvision.simulation.noise import Nodes, Octave, Raster, covering, lattice_hash, octaves, value_noise
 from lsvision.simulation.rail_profile import Hit, first_hit, head_60e1, slopes_from
 from lsvision.simulation.surfaces import Conveyor, Look, tinted
 from lsvision.simulation.trajectory import Rays
@@ -23,6 +26,7 @@ _SCALE = octaves(6)
 _STREAKS = (Octave(1, 48, 0.8), Octave(3, 160, 1.0), Octave(12, 700, 1.2))
 _DEPTH = 1  # channel of the baked surface: reflectance, depth, fall
 _RELIEF_STEPS = 2
+_CORRUGATION_STREAM = 11
 # Defects lie on the crown, where rays fall nearly along the normal; the bound only keeps hidden flanks finite.
 _LEAST_COSINE = 0.3
 
@@ -39,7 +43,7 @@ class RailScene:
     def look(self, rays: Rays) -> Look:
         """Colour and depth of the rail's head, and of the conveyor beside it."""
         look, chain = self.conveyor.look(rays), head_60e1()
-        local = rays.in_frame(self.pose)
+        local = _lowered(rays.in_frame(self.pose), self.config)
         eye_z = local.origin[:, 2]
         slopes, horizon = slopes_from(chain, local.origin[:, 0], eye_z)
         ray = local.direction(0) / local.direction(2)
@@ -89,3 +93,26 @@ class RailScene:
         fall = torch.gradient(relief.depth_mm, spacing=nodes.spacing_mm, dim=1)[0]
         albedo = (1.0 + self.config.rail_texture * grain).clamp_(0.3, 2.0) * relief.factor
         return Raster(torch.stack([albedo, relief.depth_mm, fall]), nodes)
+
+
+def corrugation_mm(scene: SceneConfig, along_mm: Tensor) -> Tensor:
+    """Height of a corrugated rail over its mean, mm, where the crown is ``along_mm`` from the frame's origin."""
+    phase = math.pi * float(lattice_hash(torch.tensor(0), _CORRUGATION_STREAM, scene.seed))
+    return scene.corrugation_mm * torch.sin(2.0 * math.pi / scene.corrugation_wavelength_mm * along_mm + phase)
+
+
+def crown_place(rays: Rays) -> Tensor:
+    """Place along the rail, mm, float64, at which each line sees the crown, from rays in the rail's frame."""
+    (across_x, across_y, across_z), (ahead_x, ahead_y, ahead_z) = rays.across.unbind(-1), rays.ahead.unbind(-1)
+    (x, y, z), turn = rays.origin.unbind(-1), across_x * ahead_z - across_z * ahead_x
+    sideways, depth = (ahead_x * z - ahead_z * x) / turn, (across_z * x - across_x * z) / turn
+    return y + sideways * across_y + depth * ahead_y
+
+
+def _lowered(rays: Rays, scene: SceneConfig) -> Rays:
+    """Rays in the rail's frame, as far below as the corrugation lifts the profile that their line sees."""
+    if scene.corrugation_mm == 0:
+        return rays
+    lower = torch.zeros_like(rays.origin)
+    lower[:, 2] = corrugation_mm(scene, crown_place(rays))
+    return replace(rays, origin=rays.origin + lower)

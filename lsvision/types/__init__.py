@@ -7,6 +7,7 @@ frame C, product frame M.
 
 from lsvision.types.calibration import (
     BoardCorners,
+    BoardEdges,
     BoardFit,
     Calibration,
     CalibrationMethod,
@@ -19,6 +20,7 @@ from lsvision.types.calibration import (
     Provenance,
     RefusedVerdict,
     Verdict,
+    WhetherLineMotion,
 )
 from lsvision.types.line_motion import LINE_COMPONENTS, LineComponent, LineFinding, LineMotion
 from lsvision.types.product import (
@@ -46,6 +48,7 @@ __all__ = [
     "LINE_COMPONENTS",
     "Board",
     "BoardCorners",
+    "BoardEdges",
     "BoardFit",
     "Calibration",
     "CalibrationMethod",
@@ -75,5 +78,6 @@ __all__ = [
     "Transport",
     "Travel",
     "Verdict",
+    "WhetherLineMotion",
     "missing_ranges",
 ]

@@ -4,13 +4,16 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from lsvision.schema import NonNegative, Positive
+from lsvision.types.line_motion import LineFinding, LineMotion
 from lsvision.types.scan import Rig
 
 CalibrationMethod = Literal["joint", "two_step", "sequential", "least_squares"]
+# Whether the motion from line to line is part of a calibration where the boards show one.
+WhetherLineMotion = Literal["auto", "none"]
 # What a calibration is worth, the first that holds from the right: see ``Calibration``.
 Verdict = Literal["determined", "prior-dominated", "inconsistent", "not converged"]
 # Verdicts without a usable n, as an option names them that uses one all the same.
@@ -30,7 +33,8 @@ class BoardCorners:
     """The corners of one board in one scan, measured and true.
 
     ``points`` are the measured ``(x, travel, z)`` of every corner in the order of ``board_points``; ``covariance`` is
-    theirs, mm². A corner with ``valid`` false was not seen; its point is NaN.
+    theirs, mm². A corner with ``valid`` false was not seen; its point is NaN. ``travel_mm`` is the travel of every line
+    of the scan, where that is known.
     """
 
     scan: str
@@ -40,6 +44,27 @@ class BoardCorners:
     board_points: Float[Tensor, "corners 3"]
     left_px: Float[Tensor, "corners 2"]
     right_px: Float[Tensor, "corners 2"] | None = None
+    travel_mm: Float[Tensor, " lines"] | None = None
+
+
+@dataclass(frozen=True)
+class BoardEdges:
+    """Where lines of a scan cross the edges of a board's squares, in both images.
+
+    A crossing is a point of the straight edge from ``start`` to ``stop`` in the board frame, mm, but it is not known
+    which. ``points`` are the measured (x, travel, z), mm; ``by_column`` is the derivative of (x, z) by the mean of the
+    columns in both images and by the disparity, mm/px; ``sigma_px`` is how well single crossings are located, up to a
+    common factor. ``segment`` is a number of the edge, ``line`` that of the line.
+    """
+
+    scan: str
+    points: Float[Tensor, "crossings 3"]
+    by_column: Float[Tensor, "crossings 2 2"]
+    sigma_px: Float[Tensor, " crossings"]
+    start: Float[Tensor, "crossings 3"]
+    stop: Float[Tensor, "crossings 3"]
+    segment: Int[Tensor, " crossings"]
+    line: Int[Tensor, " crossings"]
 
 
 @dataclass(frozen=True)
@@ -81,7 +106,9 @@ class BoardFit:
 
     ``corners`` is how many were used. ``reduced_chi_square`` compares their residuals after with their given
     covariance: 1 where they are as expected; ``largest_residual`` is that of one corner, in sigmas; None where they are
-    not known. ``outliers`` are the corners left out, as (column, row) from 1 at the board's origin.
+    not known. ``outliers`` are the corners left out, as (column, row) from 1 at the board's origin. ``line_motion`` is
+    what was found of the motion from line to line, and empty where there is none; its values are in the file of that
+    name.
     """
 
     scan: str
@@ -92,6 +119,8 @@ class BoardFit:
     reduced_chi_square: float | None = None
     outliers: tuple[tuple[int, int], ...] = ()
     largest_residual: float | None = None
+    line_motion: tuple[LineFinding, ...] = ()
+    line_motion_file: str | None = None
 
 
 @dataclass(frozen=True)
@@ -156,6 +185,8 @@ class Calibration:
     ``notes`` what else was noticed and allowed for.
     ``noise_scale`` is how many times larger than the corners' given covariance their residuals are, 1 where they are as
     expected; the covariance of n allows for it, and for the ``errors_along_scan`` that the residuals show.
+    ``line_motions`` are these line by line, for every board's scan, and empty where they are not part of the result;
+    the RMSE after is then without them.
     """
 
     method: CalibrationMethod
@@ -172,6 +203,7 @@ class Calibration:
     converged: bool = True
     noise_scale: float = 1.0
     errors_along_scan: tuple[ErrorAlongScan, ...] = ()
+    line_motions: tuple[LineMotion, ...] = ()
     provenance: Provenance = field(default_factory=lambda: Provenance("", ""))
 
     @property

@@ -25,7 +25,8 @@ class LineFinding:
     the lines, and of the errors of single lines where it is not corrected, mm or rad; ``length_mm`` is the length along
     the travel over which it changes. ``evidence`` is how much better the data fit with the component than without, in
     units of the logarithm of the likelihood. ``reason`` says why nothing was observed, where that is not the object's
-    shape.
+    shape. ``shape_rms`` is what the profile shows besides and belongs to the object's shape along its travel: it stays
+    in the height. Waves up to ``told_up_to_mm`` were told from such shape by the colours' lines.
     """
 
     component: LineComponent
@@ -35,19 +36,22 @@ class LineFinding:
     length_mm: float | None = None
     evidence: float = 0.0
     reason: str = "the object's shape does not show it"
+    shape_rms: NonNegative = 0.0
+    told_up_to_mm: float | None = None
 
     @property
     def in_words(self) -> str:
         """What was found, for a reader."""
         name, (unit, scale) = _NAMES[self.component], _SHOWN[self.component]
+        shape = f"; {self.shape_rms * scale:.2g} {unit} rms are the object's shape" if self.shape_rms > 0 else ""
         if self.state == "absent":
-            return f"{name}: nothing above the errors of a line, {self.sigma * scale:.2g} {unit}"
+            return f"{name}: nothing above the errors of a line, {self.sigma * scale:.2g} {unit}{shape}"
         if self.state == "not observed":
             error = f" better than to {self.sigma * scale:.2g} {unit}" if self.sigma > 0 else ""
             return f"{name}: not observed, {self.reason}{error}"
         length = "" if self.length_mm is None else f", over lengths of {self.length_mm:.2g} mm"
         known = f"known to {self.sigma * scale:.2g} {unit}" if self.sigma > 0 else "of unknown sigma"
-        return f"{name}: {self.rms * scale:.2g} {unit} rms, {known}{length}"
+        return f"{name}: {self.rms * scale:.2g} {unit} rms, {known}{length}{shape}"
 
 
 @dataclass(frozen=True)

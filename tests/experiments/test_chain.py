@@ -134,3 +134,36 @@ def test_a_depth_map_scan_calibrates_too(scans, command, tmp_path):
     assert command("+experiment=calibrate", f"scans=[{tmp_path / 'depth'},{scans / 'b'},{scans / 'c'}]") == 0
     calibration = read_calibration(tmp_path / "run" / "calibration.json")
     assert calibration.rmse_after_mm < 0.06
+
+
+@pytest.mark.slow
+def test_shaken_boards_are_corrected_by_the_motion_of_their_own_lines(command, tmp_path):
+    """Through files: four shaken boards, their calibration, and a product of one of them by its line motion."""
+    shaking = ("motion.vibration_x_mm=0.5", "motion.vibration_z_mm=0.5", "motion.vibration_wavelengths_mm=[233,140]")
+    tilts = {**TILTS, "d": (-1.0, -3.5, 14.0)}
+    for seed, (name, (pitch, roll, yaw)) in enumerate(tilts.items()):
+        placed = (f"scene.pitch_deg={pitch}", f"scene.roll_deg={roll}", f"scene.yaw_deg={yaw}")
+        options = ("scale=8", "threads=1", f"motion.seed={seed}", f"output={tmp_path / name}", *placed, *shaking)
+        assert command("+experiment=simulate", *options, folder=f"simulated_{name}") == 0
+    listed = ",".join(str(tmp_path / name) for name in tilts)
+    assert command("+experiment=calibrate", f"scans=[{listed}]") == 0
+    file = tmp_path / "run" / "calibration.json"
+    calibration = read_calibration(file)
+    assert calibration.verdict == "determined"
+    assert calibration.rmse_after_mm < 0.05
+    truth = torch.tensor(json.loads((tmp_path / "a" / "truth.json").read_text())["n"], dtype=torch.float64)
+    assert bool(((calibration.motion.n - truth).abs() < 4 * calibration.motion.sigma).all())
+    second = calibration.boards[1]
+    found = {finding.component: finding for finding in second.line_motion}
+    assert found["dx"].state == found["dz"].state == "corrected"
+    assert found["dx"].rms == pytest.approx(0.5, rel=0.4)
+    lines = file.with_name(second.line_motion_file)
+    options = (f"scan={tmp_path / 'b'}", f"calibration={file}", f"line_motion={lines}")
+    assert command("+experiment=correct", *options, folder="corrected") == 0
+    product = read_product(tmp_path / "corrected" / "b.zarr")
+    rows, columns = product.shape
+    grid = ProductGrid(rows, columns, product.pitch_mm, *product.origin_mm)
+    height = TensorImage(product.height(0, rows)[..., None])
+    measured = measure_board(TensorImage(product.color(0, rows)), height, grid, Board(12, 9, 30.0))
+    assert measured is not None
+    assert measured.distance_rms_mm < 0.06

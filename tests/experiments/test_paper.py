@@ -7,7 +7,7 @@ import pytest
 pytestmark = [pytest.mark.slow, pytest.mark.drawn]
 
 
-def _check(summary, *, sheet_px, numbers_rel):
+def _check(summary, *, sheet_px, numbers_rel, lines_mm):
     paper, still, vibrating = summary["paper"], summary["still"], summary["vibrating"]
     joint, two_step = still["joint"], still["two_step"]
     floor = [abs(n - true) for n, true in zip(joint["n"], joint["n_true"], strict=True)]
@@ -23,6 +23,11 @@ def _check(summary, *, sheet_px, numbers_rel):
         assert vibrating[method]["rmse_after_mm"] == pytest.approx(paper["rmse_after_mm"], rel=0.2)
     for scenario, bound in ((still, 0.06), (vibrating, paper["rmse_after_mm"])):
         assert scenario["joint"]["held_out_rmse_mm"] < bound < 2.0 < scenario["held_out_rmse_before_mm"]
+    lines = vibrating["joint with line motion"]
+    assert lines["verdict"] == "determined"
+    assert max(lines["rmse_after_mm"], lines["held_out_rmse_mm"]) <= lines_mm
+    off = [abs(n - true) / sigma for n, true, sigma in zip(lines["n"], lines["n_true"], lines["sigma"], strict=True)]
+    assert max(off) < 3
     numbers = summary["paper_numbers"]
     for key in ("rmse_before_mm", "rmse_after_mm", "stretch"):
         assert numbers[key] == pytest.approx(paper[key], rel=numbers_rel)
@@ -38,7 +43,7 @@ def _check(summary, *, sheet_px, numbers_rel):
 
 def test_the_paper_at_a_quarter_of_the_pixels(command, tmp_path):
     assert command("+experiment=paper") == 0
-    _check(json.loads((tmp_path / "run" / "summary.json").read_text()), sheet_px=1.0, numbers_rel=0.003)
+    _check(json.loads((tmp_path / "run" / "summary.json").read_text()), sheet_px=1.0, numbers_rel=0.003, lines_mm=0.03)
     assert (tmp_path / "run" / "report.html").stat().st_size > 100_000
     assert not list(tmp_path.rglob("*.partial"))
 
@@ -46,4 +51,4 @@ def test_the_paper_at_a_quarter_of_the_pixels(command, tmp_path):
 def test_the_paper_at_a_tenth_of_the_pixels(command, tmp_path):
     assert command("+experiment=paper", "scale=10", "vibrating.seed=100") == 0
     # Windows of 9 mm around a corner level a part of the shortest wave, of 61 mm, out.
-    _check(json.loads((tmp_path / "run" / "summary.json").read_text()), sheet_px=1.0, numbers_rel=0.08)
+    _check(json.loads((tmp_path / "run" / "summary.json").read_text()), sheet_px=1.0, numbers_rel=0.08, lines_mm=0.1)

@@ -25,6 +25,8 @@ from lsvision.simulation import (
     artwork,
     simulate,
 )
+from lsvision.simulation.rail import corrugation_mm, crown_place
+from lsvision.simulation.trajectory import cast_rays
 from lsvision.types import Rig
 from tests.simulation.corner_fit import fit_corners
 
@@ -127,6 +129,27 @@ def test_rail_depth_is_its_profile_along_the_motion(coarse, board, clean):
     )
     assert 0.2 < (deeper - depth).max() < 1.2
     assert (deeper - depth).min() > -1e-3
+
+
+@pytest.mark.parametrize("angle_x_deg", [0.0, 3.0])
+def test_corrugation_lifts_the_whole_profile_of_a_line(coarse, board, clean, angle_x_deg):
+    sound = SceneConfig("rail", defect_spacing_mm=0.0, roll_mark_period_mm=0.0)
+    wavy = dataclasses.replace(sound, corrugation_mm=0.2, corrugation_wavelength_mm=40.0)
+    flat, risen = (
+        simulate(coarse, board, scene, MotionConfig(angle_x_deg, 0.8), clean, Acquisition(PITCH, lines=150))
+        for scene in (sound, wavy)
+    )
+    rise = torch.cat(list(flat.depth_strips())) - torch.cat(list(risen.depth_strips()))
+    crown = int(torch.cat(list(flat.depth_strips()))[0].argmin())
+    lines = torch.arange(150, dtype=torch.float64)
+    rays = cast_rays(flat.trajectory, "left", torch.zeros(1), lines).in_frame(flat.pose)
+    expected = corrugation_mm(wavy, crown_place(rays))
+    assert expected.max() > 0.19
+    assert expected.min() < -0.19
+    torch.testing.assert_close(rise[:, crown].double(), expected, rtol=0, atol=2e-3)
+    assert (rise[:, crown - 8 : crown + 9] - rise[:, [crown]]).abs().max() < 4e-3
+    waves = torch.fft.rfft(rise[:, crown]).abs()[1:].argmax() + 1
+    assert int(waves) == round(150 * PITCH / 40.0)
 
 
 def _color_shifts(simulation, whole, board):

@@ -54,12 +54,14 @@ def enlarged(
     if block == 1:
         return disparity
     result = disparity.new_empty(block * disparity.shape[0], block * disparity.shape[1])
+    values, pixels = disparity.numpy(), result.numpy()
+    # OpenCV's compare and masked copy take half the time of torch's.
     for rows in halo_ranges(disparity.shape[0], _ROWS_AT_ONCE, 1):
-        part = disparity[rows.outer]
-        own = repeated(part, block)
-        smooth = torch.from_numpy(cv2.resize(part.numpy(), own.shape[::-1], interpolation=cv2.INTER_LINEAR))
-        # A comparison with NaN is false.
-        close = (smooth - own).abs_() < largest_step_px
+        part, own = values[rows.outer], pixels[block * rows.start : block * rows.stop]
+        size = block * part.shape[1], block * part.shape[0]
         inner = slice(block * rows.inner.start, block * rows.inner.stop)
-        torch.where(close[inner], smooth[inner], own[inner], out=result[block * rows.start : block * rows.stop])
+        smooth = cv2.resize(part, size, interpolation=cv2.INTER_LINEAR)[inner]
+        cv2.resize(part[rows.inner], own.shape[::-1], dst=own, interpolation=cv2.INTER_NEAREST)
+        close = cv2.compare(cv2.absdiff(smooth, own), largest_step_px, cv2.CMP_LT)  # not where it is NaN
+        cv2.copyTo(smooth, close, own)
     return result

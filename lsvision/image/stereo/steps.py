@@ -8,7 +8,8 @@ near a step each place must prove its side by small windows around it, every one
 - have more texture than its residuals: places that only one camera sees fit neither.
 
 How often places of such windows turned out to be of the other side, on rendered scans, gives the chance that they are,
-and with the height of the step the variance of their disparity.
+and with the height of the step the variance of their disparity. Where the window around a place fits the other side
+alone, its disparity is wrong.
 """
 
 from dataclasses import dataclass
@@ -28,9 +29,13 @@ from lsvision.image.stereo.warp import warp_cubic
 
 _STEP_PX, _STEEPEST = 2.75, 0.15  # a step is higher than this and than a slope, px a px, over the reach
 _ROOM_PX = 32  # beside the columns with a step
+_BESIDE_PX = 32  # columns beside a place at the end of the scan that show what may lie beyond
 _ROUND_PX = 3  # windows up to this distance around a place have to prove its side
 # Of two windows that differ by noise alone, the residuals of one exceed those of the other by so many variances.
 _VARIANCES, _TEXTURE = 4.0, 2.0  # and the squared slope that stands for a wrong match
+# A place is on the other side, at least so many px away, where the window around it says so by its log-likelihood and
+# fits there up to so many times the noise.
+_REFUTED_STEP_PX, _REFUTED_WINDOW_PX, _REFUTED, _FITS = 1.5, 5, -6.0, 3.0
 _LARGEST = 50.0  # log-likelihood of one pixel: one that is disturbed proves nothing about the others
 _OTHER_SIDE = 0.08  # largest chance
 
@@ -63,14 +68,27 @@ class _Zone:
 _NEAR, _FAR = _Zone(5, 3, 1.0, -0.5), _Zone(12, 7, 2.0, 1.0)
 
 
-def other_side_variance(
+@dataclass(frozen=True)
+class StepEvidence:
+    """What the surroundings of steps say about disparities.
+
+    Attributes:
+        variance: by which the disparity of a place may be that of the other side, px²; 0 away from steps.
+        refuted: whether the grey values around a place fit the other side, not its own.
+    """
+
+    variance: Float[Tensor, "rows columns"]
+    refuted: Bool[Tensor, "rows columns"]
+
+
+def step_evidence(
     left: Shaped[Tensor, "lines width"],
     right: Shaped[Tensor, "lines width"],
     disparity: Float[Tensor, "rows columns"],
     noise_variance: Float[Tensor, "rows columns"],
     lowest_px: float,
-) -> Float[Tensor, "rows columns"]:
-    """Variance, px², by which the disparity of a place near a step may be that of the other side; 0 elsewhere.
+) -> StepEvidence:
+    """Whether disparities near a step may be, or are, those of the other side.
 
     A gap belongs to the surface behind it; one that reaches an end of its line may be as low as the range allows.
 
@@ -80,7 +98,8 @@ def other_side_variance(
         noise_variance: of the difference of two pixels that match, of each block.
         lowest_px: lowest disparity of the range.
     """
-    variance, block = torch.zeros_like(disparity), block_side(left, disparity)
+    block = block_side(left, disparity)
+    found = StepEvidence(torch.zeros_like(disparity), torch.zeros_like(disparity, dtype=torch.bool))
     filled = fill_from_background(F.pad(disparity, (1, 1), value=lowest_px))
     assert filled is not None, "the two columns beside the map have values"
     surface = filled[:, 1:-1].contiguous()
@@ -89,34 +108,52 @@ def other_side_variance(
         sides = [_OtherSide.of(part.numpy(), block, lower=lower) for lower in (True, False)]
         match = _Match.of(left[:, pixels], right, part, noise_variance[:, columns], pixels.start)
         for side in sides:
-            variance[:, columns] += match.variance(side)
-    return variance
+            seen = match.against(side)
+            found.variance[:, columns] += seen.variance
+            found.refuted[:, columns] |= seen.refuted
+    return found
 
 
 def _columns_with_steps(surface: Tensor, block: int) -> Bool[Tensor, " columns"]:
     """Columns with a step, or what may turn out to be none, in any row; every second row is looked at."""
     values, around = surface[::2].contiguous().numpy(), _square(_FAR.reach_px, block)[::2]
-    height = np.subtract(cv2.dilate(values, around), cv2.erode(values, around))
-    return torch.from_numpy((height > _NEAR.least_px).any(0))
+    lowest = _extreme(values, around, block, lower=True)
+    return torch.from_numpy((cv2.dilate(values, around) - lowest > _NEAR.least_px).any(0))
+
+
+def _extreme(
+    surface: NDArray[np.float32], around: NDArray[np.uint8], block: int, *, lower: bool
+) -> NDArray[np.float32]:
+    """Lowest or highest disparity around each place.
+
+    Beyond the first and the last line the surface may be what it is beside a place on that line.
+    """
+    extreme, nearer = (cv2.erode, np.minimum) if lower else (cv2.dilate, np.maximum)
+    found, rows = np.asarray(extreme(surface, around)), len(around) // 2
+    beside = np.ones((1, around.shape[1] + 2 * (_BESIDE_PX // block)), np.uint8)
+    for near_end, line in ((found[:rows], surface[:1]), (found[-rows:], surface[-1:])):
+        nearer(near_end, extreme(line, beside), out=near_end)
+    return found
 
 
 @dataclass(frozen=True)
 class _OtherSide:
-    """Disparity of the other side of steps, px, the height of the step, 0 for none, and which places are near it."""
+    """Disparity of the other side of steps, px, the height of the step, and which places are near or far from it."""
 
     disparity: NDArray[np.float32]
     height: NDArray[np.float32]
     near: NDArray[np.bool_]
+    far: NDArray[np.bool_]
 
     @classmethod
     def of(cls, surface: NDArray[np.float32], block: int, *, lower: bool) -> "_OtherSide":
         """The lower sides of a surface, or its upper ones."""
-        extreme, sign = (cv2.erode, 1.0) if lower else (cv2.dilate, -1.0)
-        far, near = (np.asarray(extreme(surface, _square(zone.reach_px, block))) for zone in (_FAR, _NEAR))
+        sign = 1.0 if lower else -1.0
+        far, near = (_extreme(surface, _square(zone.reach_px, block), block, lower=lower) for zone in (_FAR, _NEAR))
         is_near = sign * (surface - near) > _NEAR.least_px
         is_far = sign * (surface - far) > _FAR.least_px
-        other = np.where(is_near, near, np.where(is_far, far, surface))
-        return cls(other, sign * (surface - other), is_near)
+        other = np.where(is_near, near, far)
+        return cls(other, sign * (surface - other), is_near, is_far & ~is_near)
 
 
 @dataclass(frozen=True)
@@ -125,12 +162,14 @@ class _Match:
 
     Attributes:
         left: grey values, float32, from ``first_column`` of the right image on.
+        noise: variance of the difference of two pixels that match.
         unit: variance of the grey values of a block that changes its log-likelihood by one.
     """
 
     left: Tensor
     right: Tensor
     first_column: int
+    noise: Tensor
     unit: Tensor
     own: Tensor
     wrong: Tensor
@@ -148,18 +187,30 @@ class _Match:
         slope = F.pad(left[:, 2:] - left[:, :-2], (1, 1)).mul_(0.5)
         unit = noise_variance.mul(_VARIANCES / block**2)
         own = _squared_residual(left, right, surface, first_column)
-        return cls(left, right, first_column, unit, own, _by_block(slope.square_(), surface).mul_(_TEXTURE))
+        return cls(
+            left, right, first_column, noise_variance, unit, own, _by_block(slope.square_(), surface).mul_(_TEXTURE)
+        )
 
-    def variance(self, side: _OtherSide) -> Tensor:
-        """Variance, px², by which the disparities may be those of the other side."""
-        other = _squared_residual(self.left, self.right, torch.from_numpy(side.disparity), self.first_column)
-        evidence = [
-            (squared - self.own).div_(self.unit).clamp_(-_LARGEST, _LARGEST).numpy() for squared in (other, self.wrong)
-        ]
+    def against(self, side: _OtherSide) -> StepEvidence:
+        """How the disparities compare with those of the other side."""
+        squared = _squared_residual(self.left, self.right, torch.from_numpy(side.disparity), self.first_column)
+        other, wrong = (self._log_likelihood(values) for values in (squared, self.wrong))
         block = block_side(self.left, self.own)
-        near, far = (zone.chance(evidence, block) for zone in (_NEAR, _FAR))
-        chance = torch.where(torch.from_numpy(side.near), near, far)
-        return chance.mul_(torch.from_numpy(side.height).square())
+        beside = np.where(side.near | side.far, other, np.float32(0.0))
+        chances = zip((_NEAR, _FAR), (side.near, side.far), strict=True)
+        chance = sum(zone.chance([beside, wrong], block) * torch.from_numpy(where) for zone, where in chances)
+        refuted = self._refuted(squared, other) & (side.height > _REFUTED_STEP_PX)
+        return StepEvidence(chance * torch.from_numpy(side.height).square(), torch.from_numpy(refuted))
+
+    def _refuted(self, squared: Tensor, other: NDArray[np.float32]) -> NDArray[np.bool_]:
+        """Where the other side fits as well as noise allows, and much better, from its residuals."""
+        size = (max(_REFUTED_WINDOW_PX // block_side(self.left, self.own), 1),) * 2
+        fits = cv2.blur(squared.numpy(), size) < self.noise.mul(_FITS).numpy()
+        return (cv2.boxFilter(other, -1, size, normalize=False) < _REFUTED) & fits
+
+    def _log_likelihood(self, squared: Tensor) -> NDArray[np.float32]:
+        """That of the disparities over that of others, whose residuals are given."""
+        return squared.sub(self.own).div_(self.unit).clamp_(-_LARGEST, _LARGEST).numpy()
 
 
 def _squared_residual(left: Tensor, right: Tensor, disparity: Tensor, first_column: int) -> Tensor:

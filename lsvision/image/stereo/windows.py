@@ -54,3 +54,10 @@ def window_sum(values: Float[Tensor, "rows columns"], size: int) -> Float[Tensor
     return torch.from_numpy(
         cv2.boxFilter(values.numpy(), -1, (size, size), normalize=False, borderType=cv2.BORDER_CONSTANT)
     )
+
+
+def row_window_sum(values: Float[Tensor, "lines width"], size: int) -> Float[Tensor, "lines width"]:
+    """Sum over a window along the line around each value, at the rim over the part of it within the line."""
+    return torch.from_numpy(
+        cv2.boxFilter(values.numpy(), -1, (size, 1), normalize=False, borderType=cv2.BORDER_CONSTANT)
+    )

@@ -19,6 +19,7 @@ from lsvision.types import (
     CalibrationMethod,
     ErrorAlongScan,
     Iteration,
+    LineFinding,
     Motion,
     Observability,
     ObservedDirection,
@@ -75,6 +76,8 @@ class BoardEntries(Checked):
     reduced_chi_square: NonNegative | None = None
     outliers: tuple[tuple[int, int], ...] = ()
     largest_residual: NonNegative | None = None
+    line_motion: tuple[LineFinding, ...] = ()
+    line_motion_file: str | None = None
 
     def fit(self) -> BoardFit:
         """The board's fit."""
@@ -230,7 +233,7 @@ def _motion_to_dict(motion: Motion) -> dict[str, object]:
 
 
 def _board_to_dict(board: BoardFit) -> dict[str, object]:
-    rest = {item.name: getattr(board, item.name) for item in fields(board) if item.name != "pose"}
+    rest = {key: value for key, value in asdict(board).items() if key != "pose"}
     pose = {
         "rotation": board.pose.rotation.double().tolist(),
         "translation_mm": board.pose.translation.double().tolist(),

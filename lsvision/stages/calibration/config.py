@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass, replace
 
 from lsvision.schema import AcuteAngle, Checked, NonNegative, Positive, PositiveInt, PositiveOrInfinite
-from lsvision.types import CalibrationMethod
+from lsvision.types import CalibrationMethod, WhetherLineMotion
 
 # Random walk of n per square root of a mm travelled, where the options leave it open: 2e-5 over a board of 400 mm.
 PROCESS_SIGMA: dict[CalibrationMethod, float] = {
@@ -26,7 +26,9 @@ class CalibrationConfig(Checked):
     prior lies around the poses that fit best under n = (0, 1, 0); infinite sigmas make it flat, so that no corner
     counts twice. ``two_step`` ends where the RMSE is at most ``two_step_threshold_mm``, or changes by no more than the
     share ``two_step_tolerance`` in an iteration. Errors that are correlated along the scan, as of vibration or of the
-    encoder, are allowed for where they make the corners ``correlated_odds`` times as probable. An option that is None
+    encoder, are allowed for where they make the corners ``correlated_odds`` times as probable. With ``line_motion``
+    "auto" they are then part of the result of ``joint`` and ``least_squares``, line by line; with "none" they are
+    noise. An option that is None
     takes the value of the method.
     """
 
@@ -43,6 +45,7 @@ class CalibrationConfig(Checked):
     process_sigma: NonNegative | None = None  # of the random walk of n per square root of a mm; sequential only
     depth_range_mm: Positive | None = None  # sharp depth, which proposed boards keep to; None: the rig's usual
     correlated_odds: PositiveOrInfinite = 50.0  # evidence from which errors along the scan are modelled; .inf: never
+    line_motion: WhetherLineMotion = "auto"
     mounting_pitch_deg: AcuteAngle | None = None  # known angle of a single board's normal about the sensor axis
     mounting_pitch_sigma_deg: Positive = 0.1
 

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from lsvision.estimation.gaussian_process import covariance_root
 from lsvision.stages.calibration.along_scan import (
+    SEARCHED,
     SUSPICION,
     Beforehand,
     FoundErrors,
@@ -151,7 +152,7 @@ class _Search:
                     errors = alone
             self.causes[:, i], self.rivals[:, i] = NONE, False
             self.along_scan[i] = errors
-            noisy = ReducedCorners.with_latents(one, latents(one, covariance_root(errors.covariance[None])))
+            noisy = ReducedCorners.with_latents(one, latents(one, covariance_root(errors.covariance(SEARCHED)[None])))
             self.reduced = self.reduced.replaced(i, noisy.scaled())
         return any(errors is not None for errors in self.along_scan)
 

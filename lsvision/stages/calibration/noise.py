@@ -23,7 +23,7 @@ def noise_scale(
         squared: residuals of each board, see ``squared_residuals_of_boards``.
         explained: part of the squared residuals that is known not to be noise, in sigmas.
     """
-    freedom = 3.0 * problem.valid.sum((-2, -1)) - (6 * problem.boards + 3)
+    freedom = problem.values - (6 * problem.boards + 3)
     return _beyond_chance((squared.sum(-1) - explained).clamp(min=0), freedom)
 
 

@@ -65,6 +65,12 @@ class BoardProblem:
         """Number of boards, B; the state has 6 B + 3 components."""
         return self.points.shape[-3]
 
+    @property
+    def values(self) -> Float[Tensor, "*batch"]:
+        """How many values were measured."""
+        further = 0.0 if self.correlated is None else self.correlated.further
+        return 3.0 * self.valid.sum((-2, -1)) + further
+
     def at(self, place: tuple[int | None, ...] | Bool[Tensor, "*batch"]) -> "BoardProblem":
         """One problem of a batch by its indices, or those of a mask in a row."""
         names = ("points", "noise_chol", "body_points", "centroid", "valid", "rotation")
@@ -78,8 +84,8 @@ class BoardProblem:
         """The problem with the covariance of the corners' noise multiplied by a factor."""
         sigma, correlated = noise_scale.sqrt()[..., None, None, None], self.correlated
         if correlated is not None:
-            freedom = 3.0 * self.valid.sum((-2, -1))
-            correlated = CorrelatedNoise(correlated.rows / sigma, correlated.log_det + freedom * noise_scale.log())
+            log_det = correlated.log_det + self.values * noise_scale.log()
+            correlated = replace(correlated, rows=correlated.rows / sigma, log_det=log_det)
         return replace(self, noise_chol=self.noise_chol * sigma[..., None], correlated=correlated)
 
     def rotation_at(self, theta: Float[Tensor, "*#batch boards 3"]) -> Float[Tensor, "*batch boards 3 3"]:

@@ -4,7 +4,7 @@ Both reductions are the triangular root of rows over all corners, so that sums o
 rows stay the same. They buy speed: an iteration costs the same for 88 corners as for 10.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float
@@ -19,14 +19,18 @@ _BOARDS_IN_CACHE = 64
 
 @dataclass(frozen=True)
 class CorrelatedNoise:
-    """``feature_rows`` whitened by a noise that is correlated between a board's corners, and its log-determinant."""
+    """``feature_rows`` whitened by a noise that is correlated between a board's corners, and its log-determinant.
+
+    ``further`` is how many values the rows stand for besides the corners'.
+    """
 
     rows: Float[Tensor, "*batch boards rows rows"]
     log_det: Float[Tensor, "*batch"]
+    further: float = 0.0
 
     def at(self, place: Bool[Tensor, "*batch"] | tuple[int | None, ...]) -> "CorrelatedNoise":
         """That of the problems where a mask is true, in a row; of the one at a tuple of indices."""
-        return CorrelatedNoise(self.rows[place], self.log_det[place])
+        return replace(self, rows=self.rows[place], log_det=self.log_det[place])
 
 
 def affine_rows(
@@ -75,11 +79,15 @@ def rows_with_latents(
     features: Float[Tensor, "boards corners features"],
     valid: Bool[Tensor, "boards corners"],
     latents: Float[Tensor, "boards corners 3 latents"],
+    further: Float[Tensor, "boards rows columns"] | None = None,
 ) -> CorrelatedNoise:
     """``feature_rows`` of corners that err by ``latents`` @ ξ too, ξ ~ N(0, I) of each board.
 
     ξ are unknowns with a unit prior, eliminated by the same QR: no covariance between corners is ever formed. The
     log-determinant is that of the whole noise less that of ``noise_chol``.
+
+    Args:
+        further: whitened rows on the latents, the map and 1 of whatever else was measured of the boards.
     """
     count = latents.shape[-1]
     eye = torch.eye(3, dtype=points.dtype, device=points.device)
@@ -88,7 +96,8 @@ def rows_with_latents(
     whitened = torch.linalg.solve_triangular(noise_chol, columns, upper=False)
     whitened = torch.where(valid[..., None, None], whitened, 0.0).flatten(-3, -2)
     unit = torch.eye(count, columns.shape[-1], dtype=points.dtype, device=points.device)
-    root = upper_root(torch.cat([unit.expand(*valid.shape[:-1], -1, -1), whitened], dim=-2))
+    rows = [unit.expand(*valid.shape[:-1], -1, -1), whitened, *([] if further is None else [further])]
+    root = upper_root(torch.cat(rows, dim=-2))
     by_latents = root[..., :count, :count].diagonal(dim1=-2, dim2=-1).abs().log().sum((-2, -1))
     return CorrelatedNoise(root[..., count:, count:], 2.0 * by_latents)
 

@@ -64,6 +64,7 @@ def find_corners(scan: Scan, board: Board, config: CornersConfig | None = None) 
         board_points=board.corner_points(),
         left_px=left.position,
         right_px=measured.right_px,
+        travel_mm=travel_at(scan.travel, torch.arange(scan.lines, dtype=torch.float64)),
     )
 
 

@@ -9,17 +9,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 from torch import Tensor
 
-from lsvision.geometry import ProductFrame
+from lsvision.geometry import ProductFrame, color_rows, color_shift, registered_rows
 from lsvision.image.missing import missing_mask, missing_near
 from lsvision.image.resampling import Sampling, sample_image, sampling_reach
 from lsvision.stages.correction.config import CorrectionConfig
 from lsvision.stages.correction.locate import SeenCells
 from lsvision.types import Scan
 
-_GREEN = 1
 _COARSE_FROM = 1.25  # distance of cells, in pixels, from which on smoothing does more good than harm
 
 
@@ -77,12 +76,12 @@ def sampling_for(config: CorrectionConfig, spacing: tuple[float, float]) -> Samp
 def color_lines(scan: Scan, frame: ProductFrame, lines: tuple[int, int], sampling: Sampling) -> ColorLines:
     """Colours of the lines ``lines[0]..lines[1]-1``."""
     reach = sampling_reach(sampling.coarser[0])
-    shift = _spacing(scan)
+    shift = color_shift(scan)
     if shift is None:
         image_range = max(lines[0] - reach, 0), min(lines[1] + reach, scan.lines)
         return ColorLines(frame, lines[0], image_range, sampling)
-    shift_mm, rows = shift * scan.travel.line_pitch_mm, _color_rows(scan, frame, lines, shift)
-    registered = _registered(scan, shift).tolist()
+    shift_mm, rows = shift * scan.travel.line_pitch_mm, color_rows(scan, frame, lines, shift)
+    registered = registered_rows(scan, shift).tolist()
     first, last = math.floor(float(rows.min())) - reach, math.ceil(float(rows.max())) + reach + 1
     image_range = min(max(first, 0), scan.lines - 1), max(min(last, scan.lines), 1)
     return ColorLines(frame, lines[0], image_range, sampling, shift_mm, rows, registered)
@@ -90,34 +89,10 @@ def color_lines(scan: Scan, frame: ProductFrame, lines: tuple[int, int], samplin
 
 def lines_without_colors(scan: Scan, frame: ProductFrame, sampling: Sampling) -> Bool[Tensor, " lines"]:
     """The lines of a scan of which some colour would be interpolated from missing lines of the image."""
-    lines, shift = torch.arange(scan.lines), _spacing(scan)
+    lines, shift = torch.arange(scan.lines), color_shift(scan)
     near = missing_near(missing_mask(scan.left, lines), sampling_reach(sampling.coarser[0]))
     if shift is None:
         return near
-    rows = _color_rows(scan, frame, (0, scan.lines), shift)
+    rows = color_rows(scan, frame, (0, scan.lines), shift)
     lower, upper = (row.long().clamp(0, scan.lines - 1) for row in (rows.floor(), rows.ceil()))
     return (near[lower] | near[upper]).any(0)
-
-
-def _spacing(scan: Scan) -> Float[Tensor, " channels"] | None:
-    """Lines by which each colour looks beyond green; None where all look at one line."""
-    shift = torch.tensor(scan.rig.color_spacing_lines, dtype=torch.float64)
-    shift = shift - shift[_GREEN]
-    return None if scan.left.shape[2] == 1 or not bool(shift.any()) else shift
-
-
-def _color_rows(
-    scan: Scan, frame: ProductFrame, lines: tuple[int, int], shift: Float[Tensor, " channels"]
-) -> Float[Tensor, "channels lines"]:
-    """The image row in which each colour shows what green shows on each of some lines."""
-    shift_mm = shift * scan.travel.line_pitch_mm
-    return (
-        frame.shifted_line(torch.arange(*lines, dtype=torch.float64), shift_mm[:, None])
-        + _registered(scan, shift)[:, None]
-    )
-
-
-def _registered(scan: Scan, shift: Float[Tensor, " channels"]) -> Float[Tensor, " channels"]:
-    """Rows by which the camera has shifted each colour: as many as its sensor line looks beyond green, or none."""
-    sign = -1.0 if scan.travel.transport == "reverse" else 1.0
-    return sign * shift if scan.color_registered else torch.zeros_like(shift)

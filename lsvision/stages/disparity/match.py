@@ -13,11 +13,12 @@ from lsvision.image.stereo.agreement import occluded
 from lsvision.image.stereo.blocks import block_side, enlarged, repeated
 from lsvision.image.stereo.clipping import UnusableSamples, holes_factor
 from lsvision.image.stereo.coarse_to_fine import COARSEST, match_coarse_to_fine, without_speckles
+from lsvision.image.stereo.gloss import RESIDUAL_NOISE, light_is_suspect, proven_by_detail
 from lsvision.image.stereo.refine import RefineOptions, refine_disparity
 from lsvision.image.stereo.relation import PairRelation, measure_relation
 from lsvision.image.stereo.residuals import Misfit
 from lsvision.image.stereo.sgbm import GrayPair, Search, match_sgbm
-from lsvision.image.stereo.steps import other_side_variance
+from lsvision.image.stereo.steps import step_evidence
 from lsvision.image.tiling import HaloRange
 from lsvision.stages.disparity.config import COARSE_TO_FINE_PX, DisparityConfig
 from lsvision.types import LineImage, Rig, StereoPair, TensorImage
@@ -153,13 +154,21 @@ def _measure(
         texture_confidence=config.texture_confidence,
     )
     refined = refine_disparity(left, right, disparity, options)
-    own = without_speckles(refined.disparity, _LEFT_OVER * config.speckle_px)
+    own, light_variance = refined.disparity, None
+    if light_is_suspect(left, right, own, unusable):
+        noise = (refined.residual_variance / RESIDUAL_NOISE).clamp_(max=options.noise**2)
+        proof = proven_by_detail(left, right, own, noise, options.window_blocks(block))
+        own, light_variance = own.masked_fill(~proof.proven, torch.nan), proof.variance
+    own = without_speckles(own, _LEFT_OVER * config.speckle_px)
     misfit = Misfit.of(refined.residual_variance, block)
     factor = misfit.factor
     if disparity is not searched:
         factor = factor * holes_factor(searched, disparity, options.window_blocks(block))
     lowest_px = float(disparity_range(rig, config)[0])
-    variance = other_side_variance(left, right, own, misfit.noise_variance, lowest_px)
+    steps = step_evidence(left, right, own, misfit.noise_variance, lowest_px)
+    own, variance = own.masked_fill(steps.refuted, torch.nan), steps.variance
+    if light_variance is not None:
+        variance.add_(light_variance)
     sigma = variance.addcmul_(factor, refined.sigma.square()).sqrt_().add_(own - own)  # NaN where the disparity is
     return StripMatch(enlarged(own, block)[:lines, :width], repeated(sigma, block)[:lines, :width])
 

@@ -22,6 +22,9 @@ class LineMotionConfig(Checked):
     ``evidence`` is how much better, in units of the logarithm of the likelihood, the lines must fit with a component
     for it to be corrected; and it must be ``least_ratio`` times the errors of a single line at least, as errors of the
     matching may last for many lines.
+    Waves along the travel longer than ``shape_longer_than_mm`` count as the object's shape, as bow and corrugation, and
+    stay in the height: a profile alone does not tell them from vibration. null takes all for vibration but what the
+    lines of the colours tell.
     Lines are smoothed in blocks of ``block_lines`` with ``halo_lines`` on either side.
     """
 
@@ -38,5 +41,6 @@ class LineMotionConfig(Checked):
     expected_roll_deg: Positive = 0.02
     evidence: NonNegative = 12.0
     least_ratio: NonNegative = 1.0
+    shape_longer_than_mm: Positive | None = None
     block_lines: PositiveInt = 256
     halo_lines: PositiveInt = 192

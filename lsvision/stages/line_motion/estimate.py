@@ -62,7 +62,7 @@ def estimate(
         usual_samples: how many samples of a line take part where nothing is missing.
         along_mm: travel of the lines. errors: of single lines.
     """
-    data = _noisy_values(lines, usual_samples, config)
+    data = noisy_values(lines, usual_samples, config)
     count = len(data.values)
     needed = max(_LEAST_LINES, math.ceil(config.min_share * count))
     if int(data.valid.sum()) < needed:
@@ -94,7 +94,7 @@ def _without_the_others(mean: Tensor, covariance: Tensor, kept: Tensor) -> tuple
     return (mean - left) * kept, covariance + left[:, :, None] * left[:, None]
 
 
-def _noisy_values(lines: Registered, usual_samples: int, config: LineMotionConfig) -> NoisyValues:
+def noisy_values(lines: Registered, usual_samples: int, config: LineMotionConfig) -> NoisyValues:
     """Values of lines, measured where enough samples took part and the line is no spike among its neighbours."""
     root = torch.linalg.cholesky(lines.covariance)
     valid = (lines.samples >= max(1.0, config.min_share * usual_samples)) & lines.values.isfinite().all(1)

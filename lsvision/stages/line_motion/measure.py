@@ -4,7 +4,8 @@
 2. Every line is registered to it, in blocks at fixed places of the scan.
 3. Its displacements are smoothed, and those components kept that are there (``estimate``).
 
-A profile that changes along the object, as a bent, twisted or corrugated rail's, is the same signal as a motion.
+A profile that changes along the object, as a bent, twisted or corrugated rail's, is the same signal as a motion. The
+lines of the colours, or a stated prior, tell them apart (``shape``).
 """
 
 import math
@@ -13,12 +14,17 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from lsvision.geometry import ProductFrame, depth_step_mm, object_pitch_mm, travel_at
+from lsvision.geometry import ProductFrame, color_shift, depth_step_mm, object_pitch_mm, travel_at
+from lsvision.stages.disparity.config import DisparityConfig
+from lsvision.stages.disparity.depth import relation_of_scan
+from lsvision.stages.line_motion.color_differences import ColorDifferences, measure_color_differences
+from lsvision.stages.line_motion.color_pair import color_pair
 from lsvision.stages.line_motion.config import LineMotionConfig
 from lsvision.stages.line_motion.errors import ErrorSums, LineErrors
-from lsvision.stages.line_motion.estimate import estimate, not_measured
+from lsvision.stages.line_motion.estimate import estimate, noisy_values, not_measured
 from lsvision.stages.line_motion.profiles import LineSamples, Reference, columns_of, reference_profile
 from lsvision.stages.line_motion.register import Registered, equations_of, placed, register
+from lsvision.stages.line_motion.shape import ShapeData, without_shape
 from lsvision.types import Depth, DepthSource, LineMotion, Motion, Scan
 
 _WINDOWS = 8  # of neighbouring lines, that the reference of a long scan comes from
@@ -46,7 +52,12 @@ def measure_line_motion(scan: Scan, depth: DepthSource, motion: Motion, config: 
     lines, sums = _registered(frame, depth, shown, config)
     errors = LineErrors.of(sums, depth_step_mm(scan.rig, config.common_error_px))
     along = travel_at(scan.travel, torch.arange(depth.lines).double())
-    return estimate(lines, shown.samples, along, errors, config)
+    found = estimate(lines, shown.samples, along, errors, config)
+    if found.is_still:
+        return found
+    valid = noisy_values(lines, shown.samples, config).valid
+    differences = _color_differences(scan, frame, depth, lines, shown, config)
+    return without_shape(found, ShapeData(lines, valid, along, errors, differences), config)
 
 
 @dataclass(frozen=True)
@@ -108,6 +119,18 @@ def _registered(
                 equations = equations_of(part, found.values, shown.reference, frame)
                 sums.append(ErrorSums.of(equations, config.cut_sigma))
     return lines, ErrorSums.total(sums)
+
+
+def _color_differences(
+    scan: Scan, frame: ProductFrame, depth: DepthSource, lines: Registered, shown: _Shown, config: LineMotionConfig
+) -> ColorDifferences | None:
+    """How the object moved between the moments of the colours; None where all colours look at one line."""
+    if color_shift(scan) is None:
+        return None
+    pair = color_pair(scan, frame, relation_of_scan(scan, DisparityConfig()))
+    if pair is None:
+        return None
+    return measure_color_differences(pair, depth, lines, (shown.reference, shown.columns), config)
 
 
 def _spread_lines(depth: DepthSource, count: int) -> Depth:

@@ -20,13 +20,14 @@ _SLOPE_REACH_MM = 0.4  # to either side of a place, over which the slope of a pr
 class LineSamples:
     """What some lines measured on some columns, float64: depth z and its standard deviation, mm, NaN where nothing.
 
-    ``slope`` is that of the columns' rays.
+    ``slope`` is that of the columns' rays, and ``plane_y_mm`` where along Y they look, as lines of another colour do.
     """
 
     z: Float[Tensor, "lines columns"]
     sigma: Float[Tensor, "lines columns"]
     slope: Float[Tensor, " columns"]
     columns: Int[Tensor, " columns"]
+    plane_y_mm: float = 0.0
 
     @classmethod
     def of(
@@ -43,7 +44,8 @@ class LineSamples:
 
     def on(self, columns: slice) -> "LineSamples":
         """Those of some columns."""
-        return LineSamples(self.z[:, columns], self.sigma[:, columns], self.slope[columns], self.columns[columns])
+        parts = self.z[:, columns], self.sigma[:, columns], self.slope[columns], self.columns[columns]
+        return LineSamples(*parts, self.plane_y_mm)
 
     def among(self, seen: Bool[Tensor, "lines columns"]) -> "LineSamples":
         """Those ``seen``, on the columns between the first and the last that any line has."""

@@ -2,6 +2,7 @@
 
 import math
 
+import cv2
 import pytest
 import torch
 
@@ -17,6 +18,18 @@ def test_an_edge_between_blocks_stays_sharp():
     assert (pixels[:, 2:4] < 3.0).all()
     assert pixels[:, 6:].isnan().all()
     assert (enlarged(disparity, 2, largest_step_px=0.05)[:, :4] == repeated(disparity, 2)[:, :4]).all()
+
+
+def test_enlarged_is_the_interpolated_value_where_it_is_close_to_that_of_the_block():
+    generator = torch.Generator().manual_seed(0)
+    disparity = torch.rand(70, 33, generator=generator).cumsum(1) + 9 * (torch.rand(70, 33, generator=generator) > 0.9)
+    disparity[torch.rand(70, 33, generator=generator) > 0.95] = math.nan
+    own = repeated(disparity, 2)
+    smooth = torch.from_numpy(cv2.resize(disparity.numpy(), (66, 140), interpolation=cv2.INTER_LINEAR))
+    expected = torch.where((smooth - own).abs() < 4.0, smooth, own)
+    torch.testing.assert_close(enlarged(disparity, 2), expected, rtol=0, atol=0, equal_nan=True)
+    wide = disparity.repeat(1, 2)
+    assert torch.equal(enlarged(wide[:, :33], 2).isnan(), expected.isnan())
 
 
 def test_incomplete_blocks_repeat_the_edge():

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from lsvision.image.stereo.residuals import Misfit
-from lsvision.image.stereo.steps import other_side_variance
+from lsvision.image.stereo.steps import step_evidence
 
 LINES, WIDTH, HEIGHT = 48, 200, 14
 UPPER = slice(90, 150)  # columns of the upper side in the left image
@@ -30,7 +30,7 @@ def disparity(wider_px: int = 0) -> torch.Tensor:
 def sigma(left, right, values: torch.Tensor, block: int = 1) -> torch.Tensor:
     """By column of a line in the middle, px."""
     values = values[::block, ::block].contiguous()
-    return other_side_variance(left, right, values, torch.full_like(values, 2.0), LOWEST)[12].sqrt()
+    return step_evidence(left, right, values, torch.full_like(values, 2.0), LOWEST).variance[12].sqrt()
 
 
 @pytest.mark.parametrize("block", [1, 2])
@@ -79,12 +79,40 @@ def test_partners_beyond_the_right_image(side):
     left, right = pair()
     values = torch.full((LINES, WIDTH), torch.nan)
     values[:, 60:140] = torch.where(torch.arange(60, 140) < 100, side * 190.0, side * 180.0)
-    assert other_side_variance(left, right, values, torch.ones_like(values), -190.0).isfinite().all()
+    assert step_evidence(left, right, values, torch.ones_like(values), -190.0).variance.isfinite().all()
+
+
+@pytest.mark.parametrize("block", [1, 2])
+def test_a_rim_whose_own_texture_is_that_of_the_ground_is_refuted(block):
+    left, right = pair()
+    rim = slice((UPPER.stop + 4) // block, (UPPER.stop + 7) // block)
+    for wider_px, wrong in ((8, True), (0, False)):
+        values = disparity(wider_px)[::block, ::block].contiguous()
+        refuted = step_evidence(left, right, values, torch.full_like(values, 2.0), LOWEST).refuted
+        assert refuted[:, rim].float().mean() > 0.9 if wrong else not refuted[:, rim].any()
+        assert not refuted[:, (UPPER.start + 6) // block : (UPPER.stop - 6) // block].any()
+
+
+def test_what_fits_neither_side_is_not_refuted():
+    left, right = (100 + 20 * torch.randn(LINES, WIDTH) for _ in range(2))
+    values = disparity()
+    assert not step_evidence(left, right, values, torch.full_like(values, 2.0), LOWEST).refuted.any()
+
+
+def test_beyond_the_last_line_lies_what_is_seen_beside():
+    left, right = (100 + torch.randn(LINES, WIDTH) for _ in range(2))
+    values = torch.full_like(left, torch.nan)
+    values[:, : UPPER.start] = 0.0
+    values[:, UPPER] = HEIGHT
+    column = UPPER.start + 20  # farther from the step than any window reaches
+    found = step_evidence(left, right, values, torch.full_like(values, 2.0), LOWEST).variance[:, column].sqrt()
+    assert (found[[0, 3, -4, -1]] > 0.2 * HEIGHT).all()
+    assert not found[16:-16].any()
 
 
 def test_nothing_known_is_no_step():
     nothing = torch.full((8, 8), torch.nan)
-    assert not other_side_variance(torch.zeros(8, 8), torch.zeros(8, 8), nothing, torch.ones(8, 8), LOWEST).any()
+    assert not step_evidence(torch.zeros(8, 8), torch.zeros(8, 8), nothing, torch.ones(8, 8), LOWEST).variance.any()
 
 
 def test_misfit_is_counted_from_the_usual_variance():

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from lsvision.errors import CalibrationError, FileFormatError
 from lsvision.io import check_rig_match, read_calibration, read_scan, write_calibration
-from lsvision.types import Calibration, Motion
+from lsvision.types import Calibration, LineFinding, Motion
 
 
 def plain(value: object) -> object:
@@ -70,7 +70,7 @@ def test_file_has_the_documented_keys(tmp_path: Path, calibration: Calibration) 
     assert list(data["iterations"][0]) == ["rmse_mm", "n", "stretch"]
     assert list(data["boards"][0]) == [
         *("scan", "corners", "rotation", "translation_mm", "rmse_before_mm", "rmse_after_mm"),
-        *("reduced_chi_square", "outliers", "largest_residual"),
+        *("reduced_chi_square", "outliers", "largest_residual", "line_motion", "line_motion_file"),
     ]
     assert list(data["observability"]) == ["verdict", "directions", "advice"]
     assert list(data["observability"]["directions"][0]) == ["vector", "prior_sigma", "posterior_sigma", "observed"]
@@ -179,3 +179,13 @@ def test_calibration_for_another_rig(calibration: Calibration, make_scan: Callab
     other = replace(calibration, rig=replace(calibration.rig, focal_length_mm=120.0))
     with pytest.raises(CalibrationError, match=r"scan: .* another rig: focal_length_mm 120.0, the scan's is 113.84"):
         check_rig_match(other, scan)
+
+
+def test_what_was_found_of_the_lines_comes_back(tmp_path: Path, calibration: Calibration) -> None:
+    found = LineFinding("dx", "corrected", rms=0.5, sigma=0.01, length_mm=97.0, evidence=300.0)
+    absent = LineFinding("dz", "absent", sigma=0.02, evidence=-1.5)
+    board = replace(calibration.boards[0], line_motion=(found, absent), line_motion_file="lines.parquet")
+    write_calibration(replace(calibration, boards=(board, *calibration.boards[1:])), tmp_path / "calibration.json")
+    again = read_calibration(tmp_path / "calibration.json").boards[0]
+    assert again.line_motion == (found, absent)
+    assert again.line_motion_file == "lines.parquet"

@@ -10,7 +10,7 @@ from lsvision.estimation import mean_chi_square_band, nees, upper_root
 from lsvision.estimation.gaussian_process import covariance_root
 from lsvision.stages.calibration.along_scan import SUSPICION, Linearised, by_chance, with_processes
 from lsvision.stages.calibration.along_scan.evidence import NormalEquations
-from lsvision.stages.calibration.along_scan.kernels import INTERVALS, KNOTS, kernel_family, wave_length
+from lsvision.stages.calibration.along_scan.kernels import INTERVALS, KNOTS, SEARCHED, kernel_family, wave_length
 from lsvision.stages.calibration.along_scan.lines import Travel, directions
 from lsvision.stages.calibration.calibrate import calibrate, calibrate_batch
 from lsvision.stages.calibration.config import CalibrationConfig
@@ -86,7 +86,7 @@ def some_roots() -> torch.Tensor:
 def test_reduced_rows_are_those_of_the_dense_covariance():
     problem, start = small_problem()
     roots = some_roots()
-    noise = with_processes(problem, roots[None])
+    noise = with_processes(problem, roots[None], SEARCHED)
     correlated = dataclasses.replace(problem, correlated=noise)
     covariance = dense_covariance(problem, roots)
     rows, log_det = torch.zeros(()).double(), torch.zeros(()).double()
@@ -122,7 +122,7 @@ def test_evidence_is_the_restricted_likelihood_of_dense_covariances():
     def naive(root: torch.Tensor) -> torch.Tensor:
         """-2 log likelihood, the poses and n marginalised, by the whitened rows of the whole state."""
         roots = torch.stack([standing[SIDEWAYS], root, *standing[[DEPTH, ROLL]]])
-        noise = with_processes(problem, roots[None])
+        noise = with_processes(problem, roots[None], SEARCHED)
         correlated = dataclasses.replace(problem, correlated=noise)
         rows = linearise(correlated, posterior.mean, point_factor(posterior.mean)).matrix
         n = posterior.mean[-3:]

@@ -59,6 +59,18 @@ def test_surfaces_without_texture_are_not_measured(scene, least, most):
     assert least < check(*scan(scene, replace(SOUND, noise=NOISE))) < most
 
 
+@pytest.mark.parametrize(("scene", "least"), [(BARE_RAIL, 0.6), (BARE_BOARD, 0.2), (RAIL, 0.7)])
+def test_gloss_that_both_cameras_see_elsewhere_is_not_taken_for_the_surface(scene, least):
+    left, right, truth = scan(scene, replace(SOUND, noise=NOISE))
+    column = torch.arange(RIG.width_px)[:, None]
+
+    def with_gloss(image: torch.Tensor, apart: float) -> torch.Tensor:
+        light = sum(300 * torch.exp(-((column - at - apart) / 12).square() / 2) for at in (300, 440, 480))
+        return (image.float() * 0.6 + light).clamp(0, 255).to(torch.uint8)
+
+    assert check(with_gloss(left, 0.0), with_gloss(right, 24.0), truth) > least
+
+
 def test_dark_scans_of_deep_pixels_are_as_good_as_bright_ones():
     dark = replace(SOUND, exposure=0.05 * 0.95, noise=0.05 * 1.5, bits=16)
     assert check(*scan(RAIL, dark)) > 0.93

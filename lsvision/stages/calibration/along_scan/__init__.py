@@ -4,22 +4,33 @@ The rest of the stage knows them by ``by_chance`` (whether to look), ``errors_al
 the noise that the errors make), and ``search``, ``Linearised``, ``latents`` (one problem, beside other hypotheses).
 """
 
+from lsvision.stages.calibration.along_scan.all_kernels import search_with_edges
 from lsvision.stages.calibration.along_scan.check import SUSPICION, by_chance
+from lsvision.stages.calibration.along_scan.edges import EdgeRows, edge_rows
 from lsvision.stages.calibration.along_scan.errors import ErrorsAlongScan, errors_along_scan, with_processes
 from lsvision.stages.calibration.along_scan.evidence import Linearised
+from lsvision.stages.calibration.along_scan.kernels import FINE, SEARCHED
 from lsvision.stages.calibration.along_scan.lines import COMPONENTS, latents
+from lsvision.stages.calibration.along_scan.posterior import Processes, processes_given_corners
 from lsvision.stages.calibration.along_scan.search import Beforehand, FoundErrors, search
 
 __all__ = [
     "COMPONENTS",
+    "FINE",
+    "SEARCHED",
     "SUSPICION",
     "Beforehand",
+    "EdgeRows",
     "ErrorsAlongScan",
     "FoundErrors",
     "Linearised",
+    "Processes",
     "by_chance",
+    "edge_rows",
     "errors_along_scan",
     "latents",
+    "processes_given_corners",
     "search",
+    "search_with_edges",
     "with_processes",
 ]

@@ -8,10 +8,11 @@ from torch import Tensor
 
 from lsvision.estimation.gaussian_process import covariance_root
 from lsvision.stages.calibration.along_scan.check import SUSPICION, can_be
+from lsvision.stages.calibration.along_scan.edges import EdgeRows
 from lsvision.stages.calibration.along_scan.evidence import Linearised
-from lsvision.stages.calibration.along_scan.kernels import wave_length
+from lsvision.stages.calibration.along_scan.kernels import FINE, SEARCHED, Knots, kernel_family, wave_length
 from lsvision.stages.calibration.along_scan.lines import COMPONENTS, Travel, latents
-from lsvision.stages.calibration.along_scan.search import Beforehand, search
+from lsvision.stages.calibration.along_scan.search import Beforehand, FoundErrors, search
 from lsvision.stages.calibration.problem import BoardProblem
 from lsvision.stages.calibration.reduction import CorrelatedNoise, affine_features, rows_with_latents
 
@@ -24,14 +25,17 @@ class ErrorsAlongScan:
     """The errors along the scans of a batch of problems, zero where none were ``found``.
 
     Those that are ``unlike`` any process that was tried have sigmas that need not cover what they do to n. ``rms_mm``
-    and ``length_mm`` are those of each component: the length of a wave as correlated. ``noise`` is the corners' noise
-    with these errors, None where none were found in any problem, as given where they were in others.
+    and ``length_mm`` are those of each component: the length of a wave as correlated. ``variances``, mm², are those of
+    its kernels, ``log_ratio`` how much more probable the corners are with it than without. ``noise`` is the corners'
+    noise with these errors, None where none were found in any problem, as given where they were in others.
     """
 
     found: Bool[Tensor, "*batch"]
     unlike: Bool[Tensor, "*batch"]
     rms_mm: Float[Tensor, "*batch 4"]
     length_mm: Float[Tensor, "*batch 4"]
+    variances: Float[Tensor, "*batch 4 kernels"]
+    log_ratio: Float[Tensor, "*batch 4"]
     noise: CorrelatedNoise | None
 
     def problem(self, problem: BoardProblem) -> BoardProblem:
@@ -56,11 +60,12 @@ def errors_along_scan(
         probability: of residuals as much correlated, see ``by_chance``.
         prior_sigma: of each component of n.
     """
-    rms, length = (state.new_zeros(*state.shape[:-1], len(COMPONENTS)) for _ in range(2))
+    rms, length, log_ratio = (state.new_zeros(*state.shape[:-1], len(COMPONENTS)) for _ in range(3))
+    variances = state.new_zeros(*rms.shape, len(kernel_family().log_prior))
     doubtful = probability < SUSPICION
     found, unlike = doubtful.clone(), torch.zeros_like(doubtful)
     if not bool(found.any()):
-        return ErrorsAlongScan(found, unlike, rms, length, None)
+        return ErrorsAlongScan(found, unlike, rms, length, variances, log_ratio, None)
     rows, log_det = problem.affine_rows.clone(), problem.noise_log_det.clone()
     for index in doubtful.nonzero():
         place = tuple(index.tolist())
@@ -71,22 +76,38 @@ def errors_along_scan(
             found[place] = False
             unlike[place] = (probability[place] < _BEYOND_DOUBT) & (known.process_sigma == 0)
             continue
-        rms[place] = errors.rms_mm
-        length[place] = wave_length(errors.covariance) * Travel.of(one).extent_mm
-        roots = covariance_root(errors.noise)
-        unlike[place] = not can_be(one, linearised, roots)
-        noise = with_processes(one, roots)
+        rms[place], variances[place], log_ratio[place] = errors.rms_mm, errors.variances, errors.log_ratio
+        travel = Travel.of(one)
+        length[place] = wave_length(errors.covariance(SEARCHED)) * travel.extent_mm
+        searched, fine = (covariance_root(_covariance(errors, travel, known, knots)) for knots in (SEARCHED, FINE))
+        unlike[place] = not can_be(one, linearised, searched)
+        noise = with_processes(one, fine)
         rows[place], log_det[place] = noise.rows, noise.log_det
-    return ErrorsAlongScan(found, unlike, rms, length, CorrelatedNoise(rows, log_det) if bool(found.any()) else None)
+    with_errors = CorrelatedNoise(rows, log_det) if bool(found.any()) else None
+    return ErrorsAlongScan(found, unlike, rms, length, variances, log_ratio, with_errors)
 
 
-def with_processes(problem: BoardProblem, roots: Float[Tensor, "_ 4 knots columns"]) -> CorrelatedNoise:
+def _covariance(errors: FoundErrors, travel: Travel, known: Beforehand, knots: Knots) -> Tensor:
+    """Covariance, ``(_, 4, knots, knots)`` mm², of what errors and, by board, a walk of n displace the lines by."""
+    covariance = errors.covariance(knots)[None]
+    return covariance + travel.walk(known.process_sigma, knots) if known.process_sigma else covariance
+
+
+def with_processes(
+    problem: BoardProblem,
+    roots: Float[Tensor, "_ 4 knots columns"],
+    knots: Knots = FINE,
+    edges: EdgeRows | None = None,
+) -> CorrelatedNoise:
     """The noise of a problem's corners and of a process per board and component, given by its root at the knots, mm.
+
+    Edges of the boards are measured besides.
 
     Args:
         problem: of batch shape ().
     """
     features = affine_features(problem.body_points)
-    by_latents = latents(problem, roots)
-    noise = rows_with_latents(problem.noise_chol, problem.points, features, problem.valid, by_latents)
-    return CorrelatedNoise(noise.rows, problem.noise_log_det + noise.log_det)
+    by_latents = latents(problem, roots, knots)
+    further = None if edges is None else edges.on_latents(roots, knots)
+    noise = rows_with_latents(problem.noise_chol, problem.points, features, problem.valid, by_latents, further)
+    return replace(noise, log_det=problem.noise_log_det + noise.log_det, further=0.0 if edges is None else edges.values)

@@ -10,13 +10,14 @@ Source: Patterson & Thompson 1971 (restricted likelihood); Rasmussen & Williams 
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from lsvision.stages.calibration.along_scan.kernels import KNOTS, KernelFamily
+from lsvision.stages.calibration.along_scan.edges import EdgeRows
+from lsvision.stages.calibration.along_scan.kernels import SEARCHED, KernelFamily, Knots
 from lsvision.stages.calibration.along_scan.lines import COMPONENTS, Travel, directions
 from lsvision.stages.calibration.linearise import affine_columns, point_factor
 from lsvision.stages.calibration.problem import BoardProblem, BoardState
@@ -32,11 +33,19 @@ class Linearised:
     """The corners of one problem about a state, and the prior on what all boards share: n, and further parameters.
 
     ``columns`` are derivatives of each corner's prediction by its board's pose and by what is shared, then the corner's
-    residual, mm, zero where the corner was not seen; ``prior`` are whitened rows ``[A | r]``.
+    residual, mm, zero where the corner was not seen; ``prior`` are whitened rows ``[A | r]``. ``by_map`` are the same
+    columns for the coefficients of each board's affine map, of which the last is their value, where they are known.
     """
 
     columns: Float[Tensor, "boards corners 3 columns"]
     prior: Float[Tensor, "shared shared_and_one"]
+    by_map: Float[Tensor, "boards 12 columns"] | None = None
+
+    def of_edges(self, rows: Float[Tensor, "boards rows columns_of_edges"]) -> Float[Tensor, "boards rows columns"]:
+        """Whitened rows of edges on the state and their residual, from those on the map and 1, see ``EdgeRows``."""
+        assert self.by_map is not None
+        by_state = rows[..., -13:-1] @ self.by_map
+        return torch.cat([by_state[..., :-1], rows[..., -1:] - by_state[..., -1:]], dim=-1)
 
     @classmethod
     def of(cls, problem: BoardProblem, state: Float[Tensor, " state"], prior_sigma: float) -> "Linearised":
@@ -54,7 +63,7 @@ class Linearised:
         n = BoardState.split(state).n
         eye = torch.eye(3, dtype=n.dtype, device=n.device)
         prior = torch.cat([eye, (eye[1] - n)[:, None]], -1) / prior_sigma
-        return cls(torch.where(problem.valid[..., None, None], columns, 0.0), prior)
+        return cls(torch.where(problem.valid[..., None, None], columns, 0.0), prior, coefficients)
 
 
 @dataclass(frozen=True)
@@ -83,25 +92,41 @@ class NormalEquations:
     rms_mm: Float[Tensor, "4"]
 
     @classmethod
-    def of(cls, problem: BoardProblem, linearised: Linearised) -> "NormalEquations":
-        """Those of a problem of batch shape (), whose white noise is ``noise_chol``."""
+    def of(
+        cls, problem: BoardProblem, linearised: Linearised, knots: Knots = SEARCHED, edges: EdgeRows | None = None
+    ) -> "NormalEquations":
+        """Those of a problem of batch shape (), whose white noise is ``noise_chol``, and of edges on the same knots."""
         columns, valid, count = linearised.columns, problem.valid, len(COMPONENTS)
-        by_component, weights = directions(problem), Travel.of(problem).weights(problem)
+        by_component, weights = directions(problem), Travel.of(problem).weights(problem, knots)
         eye = torch.eye(3, dtype=columns.dtype, device=columns.device)
         precision = torch.cholesky_solve(eye.expand_as(problem.noise_chol), problem.noise_chol)
         weighed = precision @ columns
         between = by_component @ precision @ by_component.mT
         flat = (between[..., None] * weights[..., None, None, :]).flatten(-3)
-        gram = (weights.mT @ flat).unflatten(-1, (count, count, KNOTS)).permute(0, 2, 3, 1, 4)
+        gram = (weights.mT @ flat).unflatten(-1, (count, count, knots.count)).permute(0, 2, 3, 1, 4)
         across = weights.mT @ (by_component @ weighed).flatten(-2)
         along = (by_component @ columns[..., -1:])[..., 0]
-        return cls(
+        corners = cls(
             gram=gram,
             cross=across.unflatten(-1, (count, -1)).movedim(-2, 1),
             state=columns.flatten(1, 2).mT @ weighed.flatten(1, 2),
             prior=linearised.prior,
             freedom=3.0 * float(valid.sum()) - _POSE * problem.boards,
             rms_mm=(along.square().sum((0, 1)) / valid.sum()).sqrt(),
+        )
+        return corners if edges is None else corners._with(edges, linearised.of_edges(edges.rows))
+
+    def _with(self, edges: EdgeRows, by_state: Float[Tensor, "boards rows columns"]) -> "NormalEquations":
+        """These and the ones of edges."""
+        count, knots = self.gram.shape[-3], self.gram.shape[-1]
+        by_knot = edges.rows[..., : count * knots]
+        gram = (by_knot.mT @ by_knot).unflatten(-1, (count, knots)).unflatten(1, (count, knots)).transpose(2, 3)
+        return replace(
+            self,
+            gram=self.gram + gram,
+            cross=self.cross + (by_knot.mT @ by_state).unflatten(1, (count, knots)),
+            state=self.state + by_state.mT @ by_state,
+            freedom=self.freedom + edges.values,
         )
 
     def given(
@@ -161,8 +186,9 @@ class NormalEquations:
         self, conditional: Conditional, family: KernelFamily, variances: Float[Tensor, " amplitudes"]
     ) -> Float[Tensor, "kernels amplitudes"]:
         """Log likelihood ratios of a process of each kernel and variance, mm², to none."""
-        process, cross = conditional.matrix[:, :KNOTS, :KNOTS], conditional.matrix[:, :KNOTS, KNOTS:]
-        state, log_det = conditional.matrix[:, KNOTS:, KNOTS:], conditional.log_det
+        knots = self.gram.shape[-1]
+        process, cross = conditional.matrix[:, :knots, :knots], conditional.matrix[:, :knots, knots:]
+        state, log_det = conditional.matrix[:, knots:, knots:], conditional.log_det
         parts = []
         for roots in family.roots:
             values, vectors = torch.linalg.eigh(roots.mT @ process[:, None] @ roots)

@@ -14,8 +14,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from lsvision.estimation.gaussian_process import cubic_weights
-from lsvision.stages.calibration.along_scan.kernels import INTERVALS, KNOTS
+from lsvision.stages.calibration.along_scan.kernels import SEARCHED, Knots
 from lsvision.stages.calibration.problem import BoardProblem
 
 COMPONENTS: tuple[Literal["x", "travel", "z", "roll"], ...] = ("x", "travel", "z", "roll")
@@ -40,42 +39,64 @@ class Travel:
         """The travel of each corner from the begin of its board, in units."""
         return (problem.points[..., 1] - self.start_mm[..., None]) / self.extent_mm[..., None, None]
 
-    def weights(self, problem: BoardProblem) -> Float[Tensor, "*batch boards corners knots"]:
+    def weights(self, problem: BoardProblem, knots: Knots = SEARCHED) -> Float[Tensor, "*batch boards corners knots"]:
         """Weights of the knots at each corner, zero where ``valid`` is false."""
-        return torch.where(problem.valid[..., None], cubic_weights(1.0 + INTERVALS * self.place(problem), KNOTS), 0.0)
+        return torch.where(problem.valid[..., None], knots.weights(self.place(problem)), 0.0)
 
-    def walk(self, process_sigma: float) -> Float[Tensor, "*batch boards knots knots"]:
-        """Covariance at the knots, mm², of what each component is displaced by where n walks at random along the scan.
+    def walk(self, process_sigma: float, knots: Knots) -> Float[Tensor, "*batch boards 4 knots knots"]:
+        """Covariance at knots, mm², of what each component is displaced by where n walks at random along the scan.
 
         It is counted from the end of each board, where n is asked for; ``process_sigma`` is per square root of a mm.
         """
-        place = (torch.arange(KNOTS, dtype=self.start_mm.dtype, device=self.start_mm.device) - 1.0) / INTERVALS
+        place = knots.place(self.start_mm)
         travel = self.start_mm[..., None] + self.extent_mm[..., None, None] * place
         left = self.extent_mm[..., None, None] * (1.0 - place).clamp(min=0.0)
         by_n = torch.minimum(left[..., :, None], left[..., None, :])
-        return process_sigma**2 * travel[..., :, None] * travel[..., None, :] * by_n
+        walk = process_sigma**2 * travel[..., :, None] * travel[..., None, :] * by_n
+        moved = walk.new_tensor([component != "roll" for component in COMPONENTS])
+        return walk[..., None, :, :] * moved[:, None, None]
+
+
+@dataclass(frozen=True)
+class Lever:
+    """The levers of a turn about the travel: counted from the ``middle`` of each board's corners, ``rms_mm`` of all."""
+
+    middle: Float[Tensor, "*batch boards 3"]
+    rms_mm: Float[Tensor, "*batch"]
+
+    @classmethod
+    def of(cls, problem: BoardProblem) -> "Lever":
+        """Those of a problem's corners."""
+        points = torch.where(problem.valid[..., None], problem.points, torch.nan)
+        middle = points.nanmean(-2)
+        across = (points - middle[..., None, :])[..., ::2].nan_to_num(nan=0.0)
+        rms = (across.square().sum((-3, -2, -1)) / problem.valid.sum((-2, -1))).sqrt().clamp(min=1e-9)
+        return cls(middle, rms)
+
+    def directions(self, points: Float[Tensor, "*batch boards points 3"]) -> Float[Tensor, "*batch boards points 4 3"]:
+        """The direction in which each component displaces points of the boards."""
+        x, y, z = (points - self.middle[..., None, :]).unbind(-1)
+        roll = torch.stack([z, torch.zeros_like(y), -x], dim=-1) / self.rms_mm[..., None, None, None]
+        straight = torch.eye(3, dtype=roll.dtype, device=roll.device).expand(*roll.shape[:-1], 3, 3)
+        return torch.cat([straight, roll[..., None, :]], dim=-2)
 
 
 def directions(problem: BoardProblem) -> Float[Tensor, "*batch boards corners 4 3"]:
     """The direction in which each component displaces each corner."""
-    points = torch.where(problem.valid[..., None], problem.points, torch.nan)
-    lever = (points - points.nanmean(-2, keepdim=True)).nan_to_num(nan=0.0)
-    roll = torch.stack([lever[..., 2], torch.zeros_like(lever[..., 0]), -lever[..., 0]], dim=-1)
-    count = problem.valid.sum((-2, -1))
-    rms = (roll.square().sum((-3, -2, -1)) / count).sqrt().clamp(min=1e-9)
-    straight = torch.eye(3, dtype=roll.dtype, device=roll.device).expand(*roll.shape[:-1], 3, 3)
-    return torch.cat([straight, (roll / rms[..., None, None, None])[..., None, :]], dim=-2)
+    seen = problem.valid[..., None]
+    lever = Lever.of(problem)
+    return lever.directions(torch.where(seen, problem.points, lever.middle[..., None, :]))
 
 
 def latents(
-    problem: BoardProblem, roots: Float[Tensor, "#boards 4 knots columns"]
+    problem: BoardProblem, roots: Float[Tensor, "#boards 4 knots columns"], knots: Knots = SEARCHED
 ) -> Float[Tensor, "boards corners 3 latents"]:
     """What standard normal latents of each board displace its corners by, mm, for processes given by their roots.
 
     Args:
-        problem: of batch shape ().
+        problem: of batch shape (). knots: at which the roots are.
     """
-    at_corners = Travel.of(problem).weights(problem)[:, None] @ roots
+    at_corners = Travel.of(problem).weights(problem, knots)[:, None] @ roots
     by_component = directions(problem).movedim(-2, 1)[..., None] * at_corners[..., None, :]
     return by_component.permute(0, 2, 3, 1, 4).flatten(-2)
 

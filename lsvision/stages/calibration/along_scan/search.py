@@ -18,7 +18,15 @@ from torch import Tensor
 
 from lsvision.estimation.gaussian_process import covariance_root
 from lsvision.stages.calibration.along_scan.evidence import Linearised, NormalEquations
-from lsvision.stages.calibration.along_scan.kernels import AMPLITUDES, KNOTS, KernelFamily, kernel_family
+from lsvision.stages.calibration.along_scan.kernels import (
+    AMPLITUDES,
+    KNOTS,
+    SEARCHED,
+    KernelFamily,
+    Knots,
+    covariance_of,
+    kernel_family,
+)
 from lsvision.stages.calibration.along_scan.lines import COMPONENTS, Travel
 from lsvision.stages.calibration.problem import BoardProblem
 
@@ -47,18 +55,23 @@ class Beforehand:
 
 @dataclass(frozen=True)
 class FoundErrors:
-    """Covariance of the errors of each component at the knots, mm², and the log evidence for it.
+    """Variances, mm², of the kernels that the errors of each component are made of, and the log evidence for them.
 
     ``rms_mm`` of each component is the most probable one, and little more than the residuals show: a covariance that is
     a mean over amplitudes is larger, above all that of waves of which most is taken for poses and n.
-    ``noise`` is that covariance and, by board, what a random walk of n explains. The constant that is missing in the
-    evidence is the same for all linearisations of a problem.
+    ``log_ratio`` is how much more probable the corners are with the errors
+    of each component than without. The constant that is missing in the evidence is the same for all linearisations of a
+    problem.
     """
 
-    covariance: Float[Tensor, "4 knots knots"]
-    noise: Float[Tensor, "_ 4 knots knots"]
+    variances: Float[Tensor, "4 kernels"]
+    log_ratio: Float[Tensor, "4"]
     rms_mm: Float[Tensor, "4"]
     log_evidence: float
+
+    def covariance(self, knots: Knots) -> Float[Tensor, "4 knots knots"]:
+        """Covariance of the errors of each component at knots, mm²."""
+        return covariance_of(self.variances, knots)
 
 
 def search(problem: BoardProblem, linearised: Linearised, known: Beforehand) -> FoundErrors | None:
@@ -76,6 +89,7 @@ class _Search:
     equations: NormalEquations
     family: KernelFamily
     covariances: Float[Tensor, "4 processes knots knots"]
+    variances: Float[Tensor, "4 processes kernels"]
     rms_mm: Float[Tensor, "4 processes"]  # geometric means
     by_kernel: Float[Tensor, "4 kernels"]  # log likelihood ratio to no error; that there is none has its part in it
     walk: Float[Tensor, "_ 4 knots knots"]  # covariance of what a walk of n explains, by board
@@ -88,12 +102,12 @@ class _Search:
         kernels = len(family.log_prior)
         walk = like.new_zeros(1, _COUNT, KNOTS, KNOTS)
         if known.process_sigma:
-            walk = Travel.of(problem).walk(known.process_sigma)[:, None].repeat(1, _COUNT, 1, 1)
-            walk[:, COMPONENTS.index("roll")] = 0.0
+            walk = Travel.of(problem).walk(known.process_sigma, SEARCHED)
         return cls(
             equations=NormalEquations.of(problem, linearised),
             family=family,
             covariances=like.new_zeros(_COUNT, _PROCESSES, KNOTS, KNOTS),
+            variances=like.new_zeros(_COUNT, _PROCESSES, kernels),
             rms_mm=like.new_zeros(_COUNT, _PROCESSES),
             by_kernel=like.new_zeros(_COUNT, kernels),
             walk=walk,
@@ -114,11 +128,9 @@ class _Search:
                 for component, weighed in zip(order, first, strict=True):
                     if weighed.present > _THERE:
                         self._weigh(component, layer, self.family.log_prior)
-        covariance = self.covariances.sum(1)
-        present, roots = self._present(covariance + self.walk)
-        log_evidence = float(self.equations.log_evidence(present, roots))
+        evidence, log_ratio = evidence_by_component(self.equations, self.covariances.sum(1) + self.walk)
         rms = torch.minimum(self.rms_mm.square().sum(-1).sqrt(), _SHOWN * self.equations.rms_mm)
-        return FoundErrors(covariance, covariance + self.walk, rms, log_evidence)
+        return FoundErrors(self.variances.sum(1), log_ratio, rms, float(evidence))
 
     def _weigh_first(self, component: int) -> "_Weighed":
         """Weigh the first process of a component."""
@@ -138,7 +150,7 @@ class _Search:
         probability = weights.sum().clamp(min=1e-300)
         log_variance = (weights * variances.log()).sum() / probability
         self.rms_mm[component, layer] = (probability * log_variance.exp()).sqrt()
-        by_variance = (weights * variances).sum(-1)
+        self.variances[component, layer] = by_variance = (weights * variances).sum(-1)
         self.covariances[component, layer] = torch.tensordot(by_variance, self.family.covariance, 1)
         by_kernel = torch.logsumexp(ratios, -1) + present
         return _Weighed(torch.logaddexp(by_kernel, by_kernel.new_tensor(absent)), float(probability))
@@ -147,13 +159,8 @@ class _Search:
         """Log likelihood ratios of a process of each kernel and amplitude to none, the others as they stand."""
         standing = self.covariances.clone()
         standing[component, layer] = 0.0
-        given = self.equations.given(component, *self._present(standing.sum(1) + self.walk))
+        given = self.equations.given(component, *_present(standing.sum(1) + self.walk))
         return self.equations.log_ratios(given, self.family, self._variances(component))
-
-    def _present(self, covariance: Tensor) -> tuple[Tensor, Tensor]:
-        """Which components err at all, and the roots of their covariances."""
-        present = covariance.flatten(-2).any(-1).any(0).nonzero()[:, 0]
-        return present, covariance_root(covariance[:, present])
 
     def _variances(self, component: int) -> Tensor:
         """The variances to try, mm²."""
@@ -166,6 +173,25 @@ class _Search:
         others = [self.by_kernel[other] for other in range(_COUNT) if other != component]
         ratio = sum((other - torch.logsumexp(other + prior, 0) for other in others), torch.zeros_like(prior))
         return prior + torch.logaddexp(ratio + math.log(_SHARED), prior.new_tensor(math.log(1.0 - _SHARED)))
+
+
+def evidence_by_component(
+    equations: NormalEquations, covariance: Float[Tensor, "_ 4 knots knots"]
+) -> tuple[Float[Tensor, ""], Float[Tensor, "4"]]:
+    """The log evidence for errors of some covariance, mm², and how much of it is lost without each component."""
+    evidence = equations.log_evidence(*_present(covariance))
+    without = []
+    for component in range(_COUNT):
+        rest = covariance.clone()
+        rest[:, component] = 0.0
+        without.append(equations.log_evidence(*_present(rest)))
+    return evidence, evidence - torch.stack(without)
+
+
+def _present(covariance: Tensor) -> tuple[Tensor, Tensor]:
+    """Which components err at all, and the roots of their covariances."""
+    present = covariance.flatten(-2).any(-1).any(0).nonzero()[:, 0]
+    return present, covariance_root(covariance[:, present])
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,83 @@
+"""The two colours of a trilinear sensor that look furthest apart along the travel: what they see, and when."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from lsvision.geometry import ProductFrame, color_rows, color_shift
+from lsvision.image.stereo.relation import PairRelation
+from lsvision.types import LineImage, Scan, StereoPair
+
+
+@dataclass(frozen=True)
+class ColorPair:
+    """The two colours of a scan that look furthest apart along Y.
+
+    Attributes:
+        relation: of the scan's two images.
+        channels: of the colour that sees a piece of the object last, and of the one that sees it first.
+        shift: lines by which each colour looks beyond green, by channel.
+    """
+
+    scan: Scan
+    images: StereoPair
+    frame: ProductFrame
+    relation: PairRelation
+    channels: tuple[int, int]
+    shift: Float[Tensor, " channels"]
+
+    @property
+    def shift_mm(self) -> Sequence[float]:
+        """Where along Y the two colours look, beyond green."""
+        return [float(self.shift[channel]) * self.scan.travel.line_pitch_mm for channel in self.channels]
+
+    def taken(self) -> Float[Tensor, "2 lines"]:
+        """The (fractional) lines on which the two colours saw what green saw on each line."""
+        shift_mm = torch.tensor(self.shift_mm, dtype=torch.float64)
+        return self.frame.shifted_line(torch.arange(self.scan.lines, dtype=torch.float64), shift_mm[:, None])
+
+    def rows(self) -> Float[Tensor, "2 lines"]:
+        """The (fractional) rows of the images that show it in the two colours."""
+        return color_rows(self.scan, self.frame, (0, self.scan.lines), self.shift)[list(self.channels)]
+
+    def left(self, channel: int, start: int, stop: int) -> Float[Tensor, "rows width"]:
+        """One colour of some rows of the left image, of 255."""
+        return _read(self.images.left, channel, torch.arange(start, stop)) * self._scale
+
+    def right(self, channel: int, start: int, stop: int) -> Float[Tensor, "rows width"]:
+        """The same of the right image, where it was taken at the same moments."""
+        shift = self.relation.rows.whole
+        return _read(self.images.right, channel, torch.arange(start + shift, stop + shift)) * self._scale
+
+    @property
+    def _scale(self) -> float:
+        return 255.0 / self.relation.levels.white
+
+
+def color_pair(scan: Scan, frame: ProductFrame, relation: PairRelation | None) -> ColorPair | None:
+    """The two colours of a scan that look furthest apart; None where all look at one line, or nothing was matched."""
+    shift = color_shift(scan)
+    if shift is None or relation is None or not isinstance(scan.images, StereoPair):
+        return None
+    channels = int(shift.argmin()), int(shift.argmax())
+    if scan.travel.transport == "reverse":
+        channels = channels[::-1]
+    return ColorPair(scan, scan.images, frame, relation, channels, shift)
+
+
+def at_rows(values: Float[Tensor, "rows ..."], row: Float[Tensor, " lines"]) -> Float[Tensor, "lines ..."]:
+    """Values at fractional rows; NaN beyond the first and the last."""
+    base = row.floor().clamp(0, len(values) - 2).long()
+    part = row - base
+    part = part.masked_fill((part < 0) | (part > 1), torch.nan).to(values)
+    return torch.lerp(values[base], values[base + 1], part.view(-1, *[1] * (values.ndim - 1)))
+
+
+def _read(image: LineImage, channel: int, rows: Tensor) -> Float[Tensor, "rows width"]:
+    """One colour of neighbouring rows of an image; beyond its ends those are repeated."""
+    inside = rows.clamp(0, image.shape[0] - 1)
+    first, last = int(inside[0]), int(inside[-1])
+    return image.read(first, last + 1)[..., channel][inside - first].float()
