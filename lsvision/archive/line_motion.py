@@ -3,6 +3,7 @@
 import hashlib
 import logging
 from dataclasses import asdict, dataclass, field
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, Literal
 
@@ -156,6 +157,12 @@ class StoredLineMotion:
         Raises:
             FileFormatError: it is not there, or damaged.
         """
+        return cls._read(str(store), origin, lines, _version(store))
+
+    @classmethod
+    @lru_cache(maxsize=1)  # planning asks before every task of a scan
+    def _read(cls, store: str, origin: Origin, lines: int, version: tuple[int, int] | None) -> "StoredLineMotion":
+        """Read one version of a file."""
         motion = read_line_motion(store, lines)
         content = motion.values.numpy().tobytes() + motion.covariance.numpy().tobytes()
         return cls(motion, origin, hashlib.sha256(content).hexdigest())
@@ -163,6 +170,15 @@ class StoredLineMotion:
     def metadata(self, travel: Travel) -> dict[str, object]:
         """What a product says about it."""
         return {**line_motion_metadata(self.motion, self.origin, travel), "sha256": self.sha256}
+
+
+def _version(path: Path | str) -> tuple[int, int] | None:
+    """What changes when a file is written anew; None where there is none."""
+    try:
+        found = Path(path).stat()
+    except OSError:
+        return None
+    return found.st_mtime_ns, found.st_size
 
 
 def line_motion_metadata(motion: LineMotion, origin: Origin, travel: Travel) -> dict[str, Any]:

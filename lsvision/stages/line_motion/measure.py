@@ -12,6 +12,7 @@ import math
 from dataclasses import dataclass
 
 import torch
+from torch import Tensor
 
 from lsvision.geometry import ProductFrame, color_shift, depth_step_mm, object_pitch_mm, travel_at
 from lsvision.stages.disparity.config import DisparityConfig
@@ -30,8 +31,8 @@ _WINDOWS = 8  # of neighbouring lines, that the reference of a long scan comes f
 _APART = 4  # lines of a window; neighbours err alike
 _READ_LINES, _AT_ONCE = 1024, 256  # read and registered at once
 _SUMMED_READS = 8  # whose residuals say how large the errors are
-_ROUNDS = 3  # of aligning lines and making the reference of them
-_CROWN_SHARE = 0.95  # of the heights of a line: about its crown, or lower
+_ROUNDS = 2  # of making the reference of lines and aligning them to it, before the last reference
+_CROWN_SHARE, _CROWN_COLUMNS = 0.95, 512  # of the heights of a line: about its crown, or lower; of columns that do
 _BELOW_MM = 5.0  # of the profile's depth, from where on samples take no part
 
 
@@ -74,23 +75,30 @@ def _shown(frame: ProductFrame, depth: DepthSource, config: LineMotionConfig) ->
     samples = LineSamples.of(spread, frame, config.height_range_mm, slice(None))
     values = samples.z.new_zeros(len(samples.z), 3)
     height = placed(samples, values, frame)[1]
-    crown = height.nanquantile(_CROWN_SHARE, dim=1).nan_to_num()
-    values[:, 1] = crown - crown.median()
-    samples = samples.among(height >= crown[:, None] - config.profile_depth_mm - _BELOW_MM)
-    first, shown = int(samples.columns[0]), None
+    crown = height[:, :: max(1, height.shape[1] // _CROWN_COLUMNS)].nanquantile(_CROWN_SHARE, dim=1)
+    values[:, 1] = (crown - crown.nanmedian()).nan_to_num()
+    samples = samples.among(~(height < crown[:, None] - config.profile_depth_mm - _BELOW_MM))
     for _ in range(_ROUNDS):
-        q_x, height = placed(samples, values, frame)
-        reference = reference_profile(q_x, height, object_pitch_mm(frame.rig), config.profile_depth_mm)
-        if reference is None:
-            return None
-        columns = columns_of(reference, q_x, config.samples)
-        if columns is None:
+        reference, columns = _seen_along(placed(samples, values, frame), frame, config)
+        if reference is None or columns is None:
             return None
         found = register(samples.on(columns), values, reference, frame, config)
         values = found.values - found.values.median(0).values
-        columns = slice(first + columns.start, first + columns.stop, columns.step)
-        shown = _Shown(reference, columns, int(found.samples.median()))
-    return shown
+    reference, columns = _seen_along(placed(samples, values, frame), frame, config)
+    if reference is None or columns is None:
+        return None
+    first = int(samples.columns[0])
+    columns = slice(first + columns.start, first + columns.stop, columns.step)
+    return _Shown(reference, columns, int(found.samples.median()))
+
+
+def _seen_along(
+    place: tuple[Tensor, Tensor], frame: ProductFrame, config: LineMotionConfig
+) -> tuple[Reference | None, slice | None]:
+    """Reference of aligned lines, (q_x, height), and the columns that show it; None where there is none."""
+    q_x, height = place
+    reference = reference_profile(q_x, height, object_pitch_mm(frame.rig), config.profile_depth_mm)
+    return reference, None if reference is None else columns_of(reference, q_x, config.samples)
 
 
 def _registered(
