@@ -18,9 +18,10 @@ from lsvision.image.tiling import one_torch_thread
 from lsvision.io import naming_full_disk, read_line_motion, write_line_motion
 from lsvision.io.formats.validation import on_one_line, read_bytes
 from lsvision.stages.disparity.config import DisparityConfig
+from lsvision.stages.line_motion.color_travel import ColorTravel
 from lsvision.stages.line_motion.config import LineMotionConfig
 from lsvision.stages.line_motion.estimate import not_measured
-from lsvision.stages.line_motion.measure import measure_line_motion
+from lsvision.stages.line_motion.measure import measure_line_motion, measure_travel
 from lsvision.stages.line_spectrum import band_of_power
 from lsvision.types import Depth, DepthSource, LineMotion, Motion, Scan, Travel
 
@@ -124,6 +125,16 @@ def measured_line_motion(scan: Scan, depth: DepthSource, motion: Motion, config:
         except (ValueError, torch.linalg.LinAlgError) as error:  # an object of next to no samples
             log.warning("%s: no line motion can be measured: %s", scan.path, on_one_line(error))
             return not_measured(scan.lines, "the scan shows no profile that lines can be registered to")
+
+
+def measured_travel(scan: Scan, depth: DepthSource, motion: Motion, config: LineMotionConfig) -> ColorTravel | None:
+    """The advance of a scan by the lines of its colours, on one thread; None where nothing shows it."""
+    with one_torch_thread():
+        try:
+            return measure_travel(scan, DepthAlone(depth), motion, config)
+        except (ValueError, torch.linalg.LinAlgError) as error:
+            log.warning("%s: no travel can be measured: %s", scan.path, on_one_line(error))
+            return None
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ import torch
 
 from lsvision.archive import calibration_for, measured_line_motion, read_calibrations
 from lsvision.archive.depth_store import create_depth_store, open_depth_store, write_depth
-from lsvision.archive.line_motion import line_motion_metadata
+from lsvision.archive.line_motion import line_motion_metadata, measured_travel
 from lsvision.experiments.settings import RunSettings
 from lsvision.geometry import ProductFrame, object_pitch_mm
 from lsvision.image.tiling import keep_freed_memory
@@ -54,6 +54,7 @@ def run_motion(settings: MotionSettings, folder: Path) -> None:
     matched = depth_of(scan, settings.disparity, n=dated.calibration.motion.n)
     with _stored_depth(scan, matched, settings.disparity, folder) as depth:
         motion = measured_line_motion(scan, depth, dated.calibration.motion, settings.registration)
+        travel = measured_travel(scan, depth, dated.calibration.motion, settings.registration)
         still = ProductFrame(scan.rig, scan.travel, dated.calibration.motion.n)
         steadied = ProductFrame(scan.rig, scan.travel, still.n, None if motion.is_still else motion)
         lines = _spread_lines(scan.lines)
@@ -62,8 +63,10 @@ def run_motion(settings: MotionSettings, folder: Path) -> None:
         before, after = (_profiles(frame, z, number, settings.registration) for frame in (still, steadied))
     metadata = line_motion_metadata(motion, "measured", scan.travel)
     write_line_motion(motion, folder / "line_motion.parquet")
-    write_json(folder / "summary.json", {"scan": str(scan.path), "lines": scan.lines, "line_motion": metadata})
-    for line in line_motion_words(metadata):
+    stated = None if travel is None else travel.metadata(float(still.n[1]))
+    summary = {"scan": str(scan.path), "lines": scan.lines, "line_motion": metadata, "travel": stated}
+    write_json(folder / "summary.json", summary)
+    for line in (*line_motion_words(metadata), *([] if travel is None else [travel.in_words])):
         log.info("%s", line)
     log.info("wrote %s", folder / "line_motion.parquet")
     view = LineMotionView.of(motion, metadata)

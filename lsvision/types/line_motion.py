@@ -51,7 +51,8 @@ class LineFinding:
             return f"{name}: not observed, {self.reason}{error}"
         length = "" if self.length_mm is None else f", over lengths of {self.length_mm:.2g} mm"
         known = f"known to {self.sigma * scale:.2g} {unit}" if self.sigma > 0 else "of unknown sigma"
-        return f"{name}: {self.rms * scale:.2g} {unit} rms, {known}{length}{shape}"
+        told = "" if self.told_up_to_mm is None else f", told from shape up to waves of {self.told_up_to_mm:.3g} mm"
+        return f"{name}: {self.rms * scale:.2g} {unit} rms, {known}{length}{told}{shape}"
 
 
 @dataclass(frozen=True)

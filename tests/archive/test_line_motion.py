@@ -10,7 +10,7 @@ import torch
 import zarr
 
 from lsvision.archive import LEDGER_FILE, Engine, EngineConfig, Ledger, LineMotionChoice, plan_one, process_one
-from lsvision.archive.line_motion import FindLineMotion
+from lsvision.archive.line_motion import FindLineMotion, line_motion_metadata
 from lsvision.archive.work import CorrectStrip, MatchStrip
 from lsvision.errors import FileFormatError, ScansFailedError
 from lsvision.experiments.correct import CorrectSettings, run_correct
@@ -421,3 +421,24 @@ def wander_of_crown(path: Path) -> float:
     row = torch.linspace(-1, 1, len(crown), dtype=torch.float64)
     line = torch.stack([torch.ones_like(row), row], dim=1)
     return float((crown - line @ torch.linalg.lstsq(line, crown[:, None]).solution[:, 0]).square().mean().sqrt())
+
+
+def test_what_the_colors_have_told_is_not_ambiguous():
+    """Waves of 30 mm in x and of 200 mm in z; the colours tell the short one, or both."""
+    along = torch.arange(2000).double()
+    values = torch.zeros(2000, 4, dtype=torch.float64)
+    values[:, 0], values[:, 1] = torch.sin(2 * torch.pi * along / 30.0), torch.sin(2 * torch.pi * along / 200.0)
+
+    def band(*told):
+        findings = tuple(
+            LineFinding(name, "corrected", 0.7, 0.1, told_up_to_mm=length)
+            for name, length in zip(("dx", "dz"), told, strict=True)
+        )
+        motion = LineMotion(values, torch.zeros(2000, 4, 4, dtype=torch.float64), findings)
+        stated = line_motion_metadata(motion, "measured", Travel(1.0))
+        assert bool(stated["note"]) == bool(stated["ambiguous_wavelengths_mm"])
+        return stated["ambiguous_wavelengths_mm"]
+
+    assert band(None, None) == pytest.approx([30.0, 200.0], rel=0.15)
+    assert band(100.0, 100.0) == pytest.approx([200.0, 200.0], rel=0.15)
+    assert band(100.0, 400.0) is None

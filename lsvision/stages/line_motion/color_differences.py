@@ -17,7 +17,7 @@ from lsvision.stages.line_motion.profiles import LineSamples, Reference
 from lsvision.stages.line_motion.register import Registered
 from lsvision.types import DepthSource
 
-_READ_LINES = 256  # worked on at once
+_READ_LINES, _AT_ONCE = 1024, 256  # lines
 
 
 @dataclass(frozen=True)
@@ -64,12 +64,14 @@ def measure_color_differences(
     whole, count = slice(columns.start, columns.stop), len(lines.values)
     colors: list[list[Registered]] = [[], []]
     for start in range(0, count, _READ_LINES):
-        stop = min(start + _READ_LINES, count)
-        samples = LineSamples.of(depth.read(start, stop), pair.frame, config.height_range_mm, whole)
-        for parts, channel, shift_mm in zip(colors, pair.channels, pair.shift_mm, strict=True):
-            seen = replace(samples, plane_y_mm=shift_mm)
-            values = lines.values[start:stop]
-            parts.append(register_color(pair, channel, start, seen, values, (reference, config.cut_sigma)))
+        block = depth.read(start, min(start + _READ_LINES, count))
+        samples = LineSamples.of(block, pair.frame, config.height_range_mm, whole)
+        for part in samples.split(_AT_ONCE):
+            values = lines.values[start : start + len(part.z)]
+            for parts, channel, shift_mm in zip(colors, pair.channels, pair.shift_mm, strict=True):
+                seen = replace(part, plane_y_mm=shift_mm)
+                parts.append(register_color(pair, channel, start, seen, values, (reference, config.cut_sigma)))
+            start += len(part.z)
     least = config.min_share * lines.samples.double().median()
     one, other = (
         at_rows(_measured(Registered.joined(parts), least), row) for parts, row in zip(colors, pair.rows(), strict=True)

@@ -17,8 +17,9 @@ from torch import Tensor
 from lsvision.geometry import ProductFrame, color_shift, depth_step_mm, object_pitch_mm, travel_at
 from lsvision.stages.disparity.config import DisparityConfig
 from lsvision.stages.disparity.depth import relation_of_scan
-from lsvision.stages.line_motion.color_differences import ColorDifferences, measure_color_differences
-from lsvision.stages.line_motion.color_pair import color_pair
+from lsvision.stages.line_motion.color_differences import measure_color_differences
+from lsvision.stages.line_motion.color_pair import ColorPair, color_pair
+from lsvision.stages.line_motion.color_travel import ColorTravel, measure_color_travel, with_travel
 from lsvision.stages.line_motion.config import LineMotionConfig
 from lsvision.stages.line_motion.errors import ErrorSums, LineErrors
 from lsvision.stages.line_motion.estimate import estimate, noisy_values, not_measured
@@ -52,12 +53,25 @@ def measure_line_motion(scan: Scan, depth: DepthSource, motion: Motion, config: 
     lines, sums = _registered(frame, depth, shown, config)
     errors = LineErrors.of(sums, depth_step_mm(scan.rig, config.common_error_px))
     along = travel_at(scan.travel, torch.arange(depth.lines).double())
-    found = estimate(lines, shown.samples, along, errors, config)
-    if found.is_still:
-        return found
-    valid = noisy_values(lines, shown.samples, config).valid
-    differences = _color_differences(scan, frame, depth, lines, shown, config)
-    return without_shape(found, ShapeData(lines, valid, along, errors, differences), config)
+    found, pair = estimate(lines, shown.samples, along, errors, config), _colors(scan, frame)
+    if not found.is_still:
+        valid = noisy_values(lines, shown.samples, config).valid
+        columns = shown.reference, shown.columns
+        differences = None if pair is None else measure_color_differences(pair, depth, lines, columns, config)
+        found = without_shape(found, ShapeData(lines, valid, along, errors, differences), config)
+    return found if pair is None else with_travel(found, measure_color_travel(pair, shown.columns), along)
+
+
+def measure_travel(scan: Scan, depth: DepthSource, motion: Motion, config: LineMotionConfig) -> ColorTravel | None:
+    """How far the object advances from line to line, from the lines of the colours; None where all look at one line.
+
+    Args:
+        depth: of the left image. motion: n of the calibration.
+    """
+    frame = ProductFrame(scan.rig, scan.travel, motion.n)
+    pair = _colors(scan, frame)
+    shown = None if pair is None else _shown(frame, depth, config)
+    return None if pair is None or shown is None else measure_color_travel(pair, shown.columns)
 
 
 @dataclass(frozen=True)
@@ -121,16 +135,11 @@ def _registered(
     return lines, ErrorSums.total(sums)
 
 
-def _color_differences(
-    scan: Scan, frame: ProductFrame, depth: DepthSource, lines: Registered, shown: _Shown, config: LineMotionConfig
-) -> ColorDifferences | None:
-    """How the object moved between the moments of the colours; None where all colours look at one line."""
+def _colors(scan: Scan, frame: ProductFrame) -> ColorPair | None:
+    """The colours that look furthest apart; None where all colours look at one line."""
     if color_shift(scan) is None:
         return None
-    pair = color_pair(scan, frame, relation_of_scan(scan, DisparityConfig()))
-    if pair is None:
-        return None
-    return measure_color_differences(pair, depth, lines, (shown.reference, shown.columns), config)
+    return color_pair(scan, frame, relation_of_scan(scan, DisparityConfig()))
 
 
 def _spread_lines(depth: DepthSource, count: int) -> Depth:

@@ -57,7 +57,7 @@ class LineSamples:
     def split(self, lines: int) -> "list[LineSamples]":
         """Those of some lines after the other."""
         parts = zip(self.z.split(lines), self.sigma.split(lines), strict=True)
-        return [LineSamples(z, sigma, self.slope, self.columns) for z, sigma in parts]
+        return [LineSamples(z, sigma, self.slope, self.columns, self.plane_y_mm) for z, sigma in parts]
 
 
 @dataclass(frozen=True)
