@@ -25,6 +25,8 @@ _USUAL_LENGTH_MM = 20.0
 _BLOCK_KNOTS, _HALO_KNOTS = 512, 512
 _LEAST_KNOTS = 32
 _TOLD = 0.25  # error of a wave's amplitude over the rms of all, with which shape and motion are told apart
+_FEWEST_WAVES = 4.0  # of a scan: of fewer, one is not told from another
+_DOUBT = 3.0  # evidence for a shape, too little to find it, from which on nothing counts as told
 _ORDER = 4  # of the Butterworth filter that splits waves by length
 
 
@@ -106,7 +108,7 @@ def _with_colors(
     fit = fit_shares(signal, rms, _USUAL_LENGTH_MM / (knots.size * pitch_mm))
     shape = replace(shape, told_up_to_mm=told_up_to_mm(signal, knots, rms, pitch_mm))
     if not _is_there(fit, 1, signal, config):
-        return shape
+        return shape if fit.evidence[1] < _DOUBT else replace(shape, told_up_to_mm=None)
     if not _is_there(fit, 0, signal, config):
         return replace(shape, is_all=True)
     mean, variance = (
@@ -131,7 +133,7 @@ def told_up_to_mm(signal: SharedSignal, knots: Knots, rms: float, pitch_mm: floa
     needed = error / max(2 * abs(signal.ratio) * _TOLD * rms, 1e-12)
     if needed >= 1:
         return None
-    return min(math.pi / math.asin(needed), float(knots.count)) * knots.size * pitch_mm
+    return min(math.pi / math.asin(needed), knots.count / _FEWEST_WAVES) * knots.size * pitch_mm
 
 
 def longer_waves(values: Float[Tensor, " lines"], pitch_mm: float, longest_mm: float) -> Float[Tensor, " lines"]:
