@@ -15,6 +15,7 @@ from lsvision.estimation.shared_signal import SharedSignal
 
 _SEGMENT = 4096  # samples of a periodogram, at most
 _FIRST_WAVE = 2  # mean and trend are no part of the signal
+_BESIDE = 1.7  # cycles in all, beside a wave, at which another may hide
 _TAPERED = 0.515  # independent waves of a Hann taper, of all
 _USUAL_SPREAD, _LENGTH_SPREAD = 2.5, 1.0  # of the logarithms of sigmas and coherence, and of lengths, beforehand
 
@@ -96,14 +97,22 @@ class Periodograms:
             return total - ((part.span / (self.samples / 32)).log() / _LENGTH_SPREAD).square().sum(-1) / 2
         return total - ((part.span[..., 1] / self.samples).log() / _USUAL_SPREAD).square() / 2
 
-    def missing_wave(self, parts: Sequence[Part]) -> Part:
-        """A wave where the periodogram of m exceeds its expectation most."""
-        expected = self.expected_sum(parts)[0].real
-        power = self.periodograms[0].real.mean(0)
-        place = int((power / expected.mean(0)).argmax())
-        sigma = (2 * power[place] / self.samples).sqrt()
-        period = self.samples / (place + _FIRST_WAVE)
-        span = power.new_tensor([period, float(self.samples)])
+    def missing_waves(self, parts: Sequence[Part]) -> list[Part]:
+        """Waves that may be missing: where the periodogram of m exceeds its expectation most, and beside the others.
+
+        Two waves closer than the taper separates look like one in the periodogram, but are wider.
+        """
+        power, expected = self.periodograms[0].real.mean(0), self.expected_sum(parts)[0].real.mean(0)
+        cycles = [int((power / expected).argmax()) + float(_FIRST_WAVE)]
+        for part in parts:
+            if part.kind == "wave":
+                cycles += [self.samples / float(part.span[0]) + side for side in (-_BESIDE, _BESIDE)]
+        return [self._wave(power, cycle) for cycle in cycles if _FIRST_WAVE <= cycle < len(power)]
+
+    def _wave(self, power: Tensor, cycles: float) -> Part:
+        """A wave of some cycles in all, as large as the periodogram shows."""
+        sigma = (2 * power[round(cycles) - _FIRST_WAVE] / self.samples).sqrt()
+        span = power.new_tensor([self.samples / cycles, float(self.samples)])
         return Part("wave", torch.stack([sigma, sigma]), span)
 
     def _periodogram(self, covariance: Tensor, window: Tensor) -> Tensor:

@@ -69,7 +69,10 @@ class _Fit:
 def _grown(waves: "Periodograms", fit: _Fit) -> _Fit:
     """The parts of a fit, and waves as long as they are worth it."""
     for _ in range(_MOST_WAVES):
-        more = _fitted(waves, (*fit.parts, waves.missing_wave(fit.parts)), _BOTH)
+        others = waves.expected_sum(fit.parts)
+        tried = [_search(waves, wave, others, list(map(float, _BOTH))) for wave in waves.missing_waves(fit.parts)]
+        wave = max(tried, key=lambda found: found[1])[0]
+        more = _fitted(waves, (*fit.parts, wave), _BOTH)
         if more.density < fit.density + _WORTH:
             break
         fit = more
