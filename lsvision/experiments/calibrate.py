@@ -77,7 +77,7 @@ def calibrate_with_edges(
 ) -> Calibration:
     """Calibrate from the corners; where they show that the boards shook, from the edges on every line as well."""
     calibration = calibrate(boards, scans[0].rig, config)
-    if not calibration.errors_along_scan or config.line_motion == "none":
+    if not calibration.errors_along_scan or not config.corrects_lines:
         return calibration
     with progress_bars() as bars:
         bar = bars.start("find edges", total=len(scans))

@@ -84,7 +84,7 @@ def _make_archive(root: Path) -> Path:
     )
     motion = Motion(torch.tensor([0.02, 1.02, -0.01]).double(), 1e-8 * torch.eye(3).double())
     path = root / "calibration.json"
-    write_calibration(Calibration("joint", motion, 1.0, 0.1, (), (), Observability("determined", (), ""), RIG), path)
+    write_calibration(Calibration("joint", motion, 1.0, 0.1, (), (), Observability((), ""), RIG), path)
     return path
 
 

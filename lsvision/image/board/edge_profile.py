@@ -21,6 +21,7 @@ points that a pixel averages over and slope of the edges; in brackets if 2 / 17 
 from dataclasses import dataclass, replace
 
 import torch
+import torch.nn.functional as F  # noqa: N812
 from jaxtyping import Bool, Float
 from torch import Tensor
 
@@ -56,12 +57,13 @@ class EdgeProfile:
         """
         width = (fit.parameters.blur[valid].square().mean() + PIXEL_VARIANCE).sqrt()
         knots = _KNOT_SPACING * width * (torch.arange(_KNOTS).to(width) + 0.5)
-        shapes = _odd_shapes(fit.saddles(valid), knots) * fit.residuals.weight[valid][:, None]
+        # Seven digits are plenty, and half the time.
+        shapes = _odd_shapes(fit.saddles(valid), knots).float() * fit.residuals.weight[valid][:, None].float()
         # The misfit is not orthogonal to the blur where that is at its bound.
-        known = torch.linalg.qr(fit.residuals.jacobian[valid][:, :_KNOWN].mT).Q
+        known = torch.linalg.qr(fit.residuals.jacobian[valid][:, :_KNOWN].mT).Q.float()
         left = shapes - (shapes @ known) @ known.mT
-        normal = (left @ shapes.mT).sum(0)
-        right = (left @ fit.misfit[valid][..., None]).sum(0)[:, 0]
+        normal = (left @ shapes.mT).sum(0).to(knots)
+        right = (left @ fit.misfit[valid][..., None].float()).sum(0)[:, 0].to(knots)
         noise = fit.residual[valid].square().mean()
         variance = (right.square().sum() - noise * normal.trace()) / normal.square().sum()
         normal.diagonal().add_(noise / variance.clamp(min=_LEAST_VARIANCE) + _LEAST_RIDGE * normal.diagonal().mean())
@@ -69,7 +71,15 @@ class EdgeProfile:
 
     def values(self, saddles: Saddle) -> Float[Tensor, "corners pixels"]:
         """Difference of the grey values from the model's."""
-        return self.amount @ _odd_shapes(saddles, self.knots)
+        edges = zip(saddles.edges, self.amount.unflatten(0, (2, -1)), saddles.steps().unbind(1), strict=True)
+        return torch.stack([self._at(edge.across, amount) * step for edge, amount, step in edges]).sum(0)
+
+    def _at(self, across: Float[Tensor, "corners pixels"], amount: Float[Tensor, " knots"]) -> Tensor:
+        """One edge's profile at signed distances from it; 0 half a spacing before the first knot and past the last."""
+        padded = F.pad(amount, (1, 2))
+        place = (across.abs() / (self.knots[1] - self.knots[0]) + 0.5).clamp(max=len(amount) + 1)
+        before = place.long()
+        return across.sign() * torch.lerp(padded[before], padded[before + 1], place - before)
 
     def moves(self, fit: SaddleFit, valid: Bool[Tensor, " corners"]) -> Float[Tensor, "moves 2"]:
         """How far corners move, px, each with its window at some places between the pixels."""

@@ -26,6 +26,7 @@ _PATCH, _PATCH_SHARE = 5, 0.7  # px; unusable samples this dense are a saturated
 _SATURATED_SHARE = 0.002  # of the pixels of an image
 _SAMPLED, _MEAN_PX = 32, 9  # every so many lines are compared, by means over so many columns
 _OTHER_LIGHT, _OTHER_SHARE = 8.0, 0.1  # difference of grey values, of 255, and the share of the matched pixels
+_NOISES = 4.0  # standard deviations of a mean over as many columns
 _TILE_LINES = 256  # stay in the processor's cache
 _APART = 4  # lines over which details along the scan are differences
 # Variance of a detail of white noise, over that of the noise, and of its residual: interpolation has smoothed the
@@ -43,6 +44,7 @@ def light_is_suspect(
     right: Shaped[Tensor, "lines right_width"],
     disparity: Float[Tensor, "rows columns"],
     unusable: UnusableSamples,
+    noise_variance: float,
 ) -> bool:
     """Whether both images have saturated areas, or many places differ in brightness between the cameras.
 
@@ -52,9 +54,10 @@ def light_is_suspect(
     Args:
         left, right: grey values of 255, the right ones as bright as the left ones.
         disparity: px, of each pixel or each block of 2 x 2 pixels, NaN for none.
+        noise_variance: of the difference of two pixels that match.
     """
     saturated = all(_saturated_share(samples) > _SATURATED_SHARE for samples in (unusable.left, unusable.right))
-    return saturated or _differing_share(left, right, disparity) > _OTHER_SHARE
+    return saturated or _differing_share(left, right, disparity, noise_variance) > _OTHER_SHARE
 
 
 def _saturated_share(unusable: Bool[Tensor, "lines width"] | None) -> float:
@@ -65,7 +68,7 @@ def _saturated_share(unusable: Bool[Tensor, "lines width"] | None) -> float:
     return float((density > 255 * _PATCH_SHARE).mean())
 
 
-def _differing_share(left: Tensor, right: Tensor, disparity: Tensor) -> float:
+def _differing_share(left: Tensor, right: Tensor, disparity: Tensor, noise_variance: float) -> float:
     """Share of the matched pixels of some lines that are brighter or darker than their partners."""
     block = block_side(left, disparity)
     sampled = repeated(disparity[:: _SAMPLED // block], block)[::block, : left.shape[1]]
@@ -76,7 +79,8 @@ def _differing_share(left: Tensor, right: Tensor, disparity: Tensor) -> float:
         cv2.boxFilter(values.numpy(), -1, (_MEAN_PX, 1), normalize=False)
         for values in (matched.to(torch.float32), difference)
     )
-    differing = (abs(total) > _OTHER_LIGHT * count) & matched.numpy()
+    limit = _OTHER_LIGHT + _NOISES * (noise_variance / _MEAN_PX) ** 0.5
+    differing = (abs(total) > limit * count) & matched.numpy()
     return float(differing.sum()) / max(int(matched.sum()), 1)
 
 

@@ -35,6 +35,11 @@ class Misfit:
         return cls(around, variance.div(_DISTURBED * usual).clamp_(min=1.0))
 
 
+def usual_variance(variance: Float[Tensor, "rows columns"], block: int) -> float:
+    """The median over a map of the variance around each block of ``block`` pixels a side; NaN where there is none."""
+    return float(variance[:: _STEP // block, :: _STEP // block].nanmedian())
+
+
 def _tile_medians(sampled: Float[Tensor, "rows columns"]) -> Float[Tensor, "tile_rows tile_columns"]:
     """Median over each tile, NaN where less than half of it has a match."""
     side = _TILE // _STEP

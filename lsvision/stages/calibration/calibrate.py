@@ -63,7 +63,7 @@ def calibrate(
         solution = solve(measured, replace(config, correlated_odds=math.inf))
         shaken = bool(solution.along_scan.found)
     by_edges: tuple[str, ...] = ()
-    if shaken and edges is not None and solution.corrects_lines:
+    if shaken and edges is not None and config.corrects_lines:
         by_corners, solution = solution, with_edges(solution, edges)
         by_edges = _what_edges_did(by_corners, solution)
     batch, scale = solution.summary(), float(solution.noise_scale)
@@ -140,7 +140,7 @@ def _line_motions(
 ) -> tuple[LineMotion, ...]:
     """The motion from line to line of every scan; none where it is not asked for or the lines are not known."""
     travels = [board.travel_mm for board in boards if board.travel_mm is not None]
-    if not solution.corrects_lines or len(travels) < len(boards):
+    if not solution.config.corrects_lines or len(travels) < len(boards):
         return ()
     reach = torch.stack([torch.stack(travel.aminmax()) for travel in travels])
     parts = (batch.along_scan_rms_mm, batch.along_scan_length_mm, solution.along_scan.log_ratio)

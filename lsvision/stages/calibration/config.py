@@ -13,6 +13,7 @@ PROCESS_SIGMA: dict[CalibrationMethod, float] = {
     "sequential": 1e-6,
     "least_squares": 0.0,
 }
+_ALL_TOGETHER = ("joint", "least_squares")  # methods that weigh all corners together
 _WITHOUT_PITCH = ("two_step", "sequential")  # methods that cannot use a mounting pitch
 
 
@@ -55,6 +56,11 @@ class CalibrationConfig(Checked):
             raise self.fault(
                 "mounting_pitch_deg", f"expected null, as {self.method} cannot use it, got {self.mounting_pitch_deg}"
             )
+
+    @property
+    def corrects_lines(self) -> bool:
+        """Whether the motion from line to line is part of the result where the boards show one."""
+        return self.line_motion == "auto" and self.method in _ALL_TOGETHER
 
     def resolved(self) -> "CalibrationConfig":
         """The same with the method's own value of every option that is None."""

@@ -27,9 +27,6 @@ from lsvision.stages.calibration.problem import BoardProblem, MountingPitch
 from lsvision.stages.calibration.scatter import widened
 from lsvision.stages.calibration.solution import estimate_with_noise
 
-# Methods that weigh all corners together, from whose result the motion of the lines follows.
-_JOINT = ("joint", "least_squares")
-
 
 @dataclass(frozen=True)
 class Solution:
@@ -54,15 +51,10 @@ class Solution:
         """The problems with the noise that the posteriors allow for, but for its scale."""
         return replace(self.problem, correlated=self.along_scan.noise)
 
-    @property
-    def corrects_lines(self) -> bool:
-        """Whether the motion from line to line is part of the result."""
-        return self.config.line_motion == "auto" and self.config.method in _JOINT
-
     @cached_property
     def steadied(self) -> BoardProblem:
         """The problems with their corners where they would have been measured without the motion of their lines."""
-        if not self.corrects_lines or not bool(self.along_scan.found.any()):
+        if not self.config.corrects_lines or not bool(self.along_scan.found.any()):
             return self.problem
         points = self.problem.points.clone()
         for place in self._found():

@@ -75,6 +75,7 @@ class MatchedDepth:
         rows = self.rectified.rows_of(start, stop)
         rig = self.rectified.rectification.matched_rig
         match = measure_lines(self.rectified.images, self.relation, rig, self.config, rows)
+        match = self.rectified.without_unseen(match, rows, self.relation.rows.whole)
         depth = self.rectified.depth(match, rows, start, stop)
         return depth if self.config.tells_sigma else Depth(depth.z)
 

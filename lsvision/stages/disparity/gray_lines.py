@@ -24,7 +24,7 @@ class GrayLines:
         """Those of some lines; beyond the ends of the image its first and last line stand for all.
 
         An image that is resampled is so as grey values: one channel of three. What is interpolated from an unusable
-        sample is unusable, and so is what the camera did not see.
+        sample is unusable.
         """
         if isinstance(image, ResampledImage):
             return cls._resampled(image, lines, levels, white)
@@ -36,12 +36,9 @@ class GrayLines:
     def _resampled(cls, image: ResampledImage, lines: range, levels: CameraLevels, white: float) -> "GrayLines":
         taken = image.source_lines(lines)
         codes = image.source.read(taken.start, taken.stop)
-        bad, unseen = levels.unusable(codes), image.outside(lines)
+        bad = levels.unusable(codes)
         brightness = image.resample(_gray(codes, white)[..., None], taken.start, lines)[..., 0]
-        if bad is None:
-            return cls(brightness, unseen)
-        spoilt = image.spread(bad, taken.start, lines)
-        return cls(brightness, spoilt if unseen is None else spoilt | unseen)
+        return cls(brightness, None if bad is None else image.spread(bad, taken.start, lines))
 
 
 def _read_within(image: LineImage, lines: range) -> Tensor:

@@ -15,7 +15,7 @@ from lsvision.image.stereo.coarse_to_fine import COARSEST, match_coarse_to_fine,
 from lsvision.image.stereo.gloss import RESIDUAL_NOISE, light_is_suspect, proven_by_detail
 from lsvision.image.stereo.refine import RefineOptions, refine_disparity
 from lsvision.image.stereo.relation import PairRelation, measure_relation
-from lsvision.image.stereo.residuals import Misfit
+from lsvision.image.stereo.residuals import Misfit, usual_variance
 from lsvision.image.stereo.sgbm import GrayPair, Search, match_sgbm
 from lsvision.image.stereo.steps import step_evidence
 from lsvision.image.tiling import HaloRange
@@ -150,8 +150,10 @@ def _measure(
     )
     refined = refine_disparity(left, right, disparity, options)
     own, light_variance = refined.disparity, None
-    if light_is_suspect(left, right, own, unusable):
-        noise = (refined.residual_variance / RESIDUAL_NOISE).clamp_(max=options.noise**2)
+    usual = usual_variance(refined.residual_variance, block)
+    if light_is_suspect(left, right, own, unusable, usual):
+        largest = max(options.noise**2, usual / RESIDUAL_NOISE)
+        noise = (refined.residual_variance / RESIDUAL_NOISE).clamp_(max=largest)
         proof = proven_by_detail(left, right, own, noise, options.window_blocks(block))
         own, light_variance = own.masked_fill(~proof.proven, torch.nan), proof.variance
     own = without_speckles(own, _LEFT_OVER * config.speckle_px)

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from lsvision.geometry import Rectification
 from lsvision.image.resampled import ResampledImage, ShearedRows
+from lsvision.image.stereo.clipping import UnusableSamples
 from lsvision.image.tiling import in_parallel, tiles
 from lsvision.stages.disparity.config import DisparityConfig
 from lsvision.stages.disparity.match import StripMatch, disparity_range
@@ -32,7 +33,8 @@ _LEAST_MM = 1e-6  # of travel; a shear below that is rounding
 class RectifiedPair:
     """The images of a raw scan as they are matched, resampled where they are read; ``lines`` is the scan's length."""
 
-    images: StereoPair
+    left: LineImage
+    right: ResampledImage
     rectification: Rectification
     left_rows: ShearedRows
     lines: int
@@ -54,11 +56,27 @@ class RectifiedPair:
         right_rows = ShearedRows(scan.travel, left_rows.rows, left_rows.first, late[1])
         left: LineImage = scan.left if late[0] is None else ResampledImage(scan.left, None, left_rows)
         right = ResampledImage(scan.images.right, rectification.matched_right_columns, right_rows)
-        return cls(StereoPair(left, right), rectification, left_rows, scan.lines)
+        return cls(left, right, rectification, left_rows, scan.lines)
+
+    @property
+    def images(self) -> StereoPair:
+        """Both images."""
+        return StereoPair(self.left, self.right)
 
     def rows_of(self, start: int, stop: int) -> range:
         """The rows on which the left image shows lines ``start..stop-1``."""
         return range(*self.left_rows.reach((start, stop))) if self.left_rows.late_mm is not None else range(start, stop)
+
+    def without_unseen(self, match: StripMatch, rows: range, shift: int) -> StripMatch:
+        """What was matched on some rows, less partners before the right image's first line or after its last.
+
+        Args:
+            shift: by how many rows later the right image was read.
+        """
+        unseen = self.right.outside(range(rows.start + shift, rows.stop + shift))
+        if unseen is None:
+            return match
+        return StripMatch(UnusableSamples(None, unseen).removed_from(match.disparity, 1), match.sigma)
 
     def depth(self, match: StripMatch, rows: range, start: int, stop: int) -> Depth:
         """Depth of lines ``start..stop-1`` of the ideal left image, from what was matched on their rows.

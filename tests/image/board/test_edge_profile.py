@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from lsvision.image.board.correlated_noise import BoardNoise
-from lsvision.image.board.edge_profile import EdgeProfile, board_noise
+from lsvision.image.board.edge_profile import EdgeProfile, _odd_shapes, board_noise
 from lsvision.image.board.saddle import SaddleFit, fit_saddles
 from lsvision.image.board.saddle_model import BlurredEdge
 from tests.image.board.conftest import SIZE, saddle_windows
@@ -65,6 +65,15 @@ def test_the_profile_is_that_of_the_pixels():
     )
     assert expected.abs().max() > 0.1
     assert (found - expected).norm() < 0.4 * expected.norm()
+
+
+def test_values_are_those_of_the_shapes():
+    windows, _, angles = sampled_windows(2, 0.3)
+    fit = fit_saddles(windows, angles)
+    profile = EdgeProfile.of(fit, EVERY)
+    saddles = fit.saddles(EVERY)
+    shapes = profile.amount @ _odd_shapes(saddles, profile.knots)
+    torch.testing.assert_close(profile.values(saddles), shapes, rtol=0, atol=1e-9)
 
 
 def test_noise_is_no_profile():

@@ -94,9 +94,16 @@ def test_what_does_not_match_proves_nothing_about_its_neighbours():
 def test_equal_light_is_not_suspect_and_other_light_is(block):
     left, right = noisy(grain(0.0), 1), noisy(grain(DISPARITY), 2)
     disparity = everywhere(block)
-    assert not light_is_suspect(left, right, disparity, NONE)
-    assert light_is_suspect(left + stripe(120.0), right + stripe(90.0), disparity, NONE)
-    assert not light_is_suspect(left, right, torch.full_like(disparity, torch.nan), NONE)
+    assert not light_is_suspect(left, right, disparity, NONE, 2.0)
+    assert light_is_suspect(left + stripe(120.0), right + stripe(90.0), disparity, NONE, 2.0)
+    assert not light_is_suspect(left, right, torch.full_like(disparity, torch.nan), NONE, 2.0)
+
+
+def test_noise_is_no_other_light():
+    noise = torch.randn(2, LINES, WIDTH, generator=torch.Generator().manual_seed(4))
+    left, right = grain(0.0) + 20 * noise[0], grain(DISPARITY) + 20 * noise[1]
+    assert not light_is_suspect(left, right, everywhere(), NONE, 800.0)
+    assert light_is_suspect(left, right, everywhere(), NONE, 2.0)
 
 
 def test_saturated_areas_are_suspect_and_single_samples_are_not():
@@ -105,15 +112,15 @@ def test_saturated_areas_are_suspect_and_single_samples_are_not():
     single, area = (torch.zeros(LINES, WIDTH, dtype=torch.bool) for _ in range(2))
     single[torch.rand(LINES, WIDTH, generator=torch.Generator().manual_seed(0)) < 0.1] = True
     area[20:30, 40:52] = True
-    assert not light_is_suspect(left, right, disparity, UnusableSamples(single, single))
-    assert not light_is_suspect(left, right, disparity, UnusableSamples(None, area))  # a brighter camera
-    assert light_is_suspect(left, right, disparity, UnusableSamples(area, area))
+    assert not light_is_suspect(left, right, disparity, UnusableSamples(single, single), 2.0)
+    assert not light_is_suspect(left, right, disparity, UnusableSamples(None, area), 2.0)  # a brighter camera
+    assert light_is_suspect(left, right, disparity, UnusableSamples(area, area), 2.0)
 
 
 def test_images_of_odd_sizes():
     left, right = grain(0.0)[:-1, :-1], grain(DISPARITY)[:-1, :-1]
     disparity = everywhere(2)
-    assert not light_is_suspect(left, right, disparity, NONE)
+    assert not light_is_suspect(left, right, disparity, NONE, 2.0)
     found = proven_by_detail(left, right, disparity, torch.ones_like(disparity), 5).proven
     assert found[:, 16:-8].float().mean() > 0.85
 

@@ -76,6 +76,10 @@ def test_dark_scans_of_deep_pixels_are_as_good_as_bright_ones():
     assert check(*scan(RAIL, dark)) > 0.93
 
 
+def test_noise_is_not_taken_for_other_light():
+    assert check(*scan(SHEET, replace(SOUND, exposure=0.05 * 0.95, noise=NOISE))) > 0.6
+
+
 def test_faulty_columns_and_a_line_counter_spoil_themselves_alone():
     left, right, truth = scan(RAIL, SOUND)
     left, right = (image.to(torch.int32) * 16 for image in (left, right))
