@@ -11,6 +11,7 @@ from lsvision import __version__
 from lsvision.errors import CalibrationError, ConfigError, UnusableCalibrationError
 from lsvision.experiments.settings import RunSettings, settings_sha256
 from lsvision.geometry import Rectification
+from lsvision.image.tiling import one_torch_thread
 from lsvision.io import read_scan, scan_sha256, write_calibration, write_json, write_line_motion
 from lsvision.report import calibration_report, calibration_summary
 from lsvision.report.progress import progress_bars
@@ -21,7 +22,7 @@ from lsvision.stages.corners.config import CornersConfig
 from lsvision.stages.corners.edges import find_edges
 from lsvision.stages.corners.find import LocatedCorners, locate_in_images, measure_corners
 from lsvision.stages.corners.rows import row_difference
-from lsvision.types import Board, BoardCorners, Calibration, MissingLines, Provenance, Scan
+from lsvision.types import Board, BoardCorners, BoardEdges, Calibration, MissingLines, Provenance, Scan
 
 log = logging.getLogger(__name__)
 
@@ -75,17 +76,25 @@ def run_calibrate(settings: CalibrateSettings, folder: Path) -> None:
 def calibrate_with_edges(
     scans: Sequence[Scan], boards: Sequence[BoardCorners], board: Board, config: CalibrationConfig
 ) -> Calibration:
-    """Calibrate from the corners; where they show that the boards shook, from the edges on every line as well."""
-    calibration = calibrate(boards, scans[0].rig, config)
-    if not calibration.errors_along_scan or not config.corrects_lines:
-        return calibration
+    """Calibrate from the corners; where they show that the boards shook, from the edges on every line as well.
+
+    On one thread: the matrices are small, and threads that wait for each other cost more than they save.
+    """
+    with one_torch_thread():
+        calibration = calibrate(boards, scans[0].rig, config)
+        if not calibration.errors_along_scan or not config.corrects_lines:
+            return calibration
+        return calibrate(boards, scans[0].rig, config, _edges_of(scans, boards, board))
+
+
+def _edges_of(scans: Sequence[Scan], boards: Sequence[BoardCorners], board: Board) -> list[BoardEdges | None]:
     with progress_bars() as bars:
         bar = bars.start("find edges", total=len(scans))
-        edges = []
+        edges: list[BoardEdges | None] = []
         for scan, corners in zip(scans, boards, strict=True):
             edges.append(find_edges(scan, board, corners))
             bars.advance(bar)
-    return calibrate(boards, scans[0].rig, config, edges)
+    return edges
 
 
 def write_line_motions(calibration: Calibration, target: Path) -> Calibration:

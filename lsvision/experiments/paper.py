@@ -21,6 +21,7 @@ from lsvision.experiments.parallel import map_names, scan_pool
 from lsvision.experiments.settings import RunSettings
 from lsvision.experiments.simulate import write_simulation
 from lsvision.geometry import displace, scaled_rig
+from lsvision.image.tiling import one_torch_thread
 from lsvision.io import Product, read_product, read_scan, write_calibration, write_json
 from lsvision.report.paper_pages import write_paper_report
 from lsvision.report.paper_scenario import HELD_OUT, PAPER, BoardCheck, Scenario, Trial
@@ -183,7 +184,8 @@ def _with_line_motion(
     result = calibrate_with_edges([scans[name] for name in seen], boards, settings.board, config)
     held_out = corners[HELD_OUT]
     edges = find_edges(scans[HELD_OUT], settings.board, held_out)
-    own = calibrate_lines(held_out, edges, result.motion.n, scans[HELD_OUT].rig, config)
+    with one_torch_thread():
+        own = calibrate_lines(held_out, edges, result.motion.n, scans[HELD_OUT].rig, config)
     return Trial(result, n_true, own.rmse_after_mm)
 
 
