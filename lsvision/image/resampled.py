@@ -242,7 +242,6 @@ class ColumnMap:
 
     def __call__(self, column: Float[Tensor, "*cells"]) -> Float[Tensor, "*cells"]:
         """Columns of the source, px, in the dtype of ``column``; those beyond the ends go on evenly."""
-        base = column.nan_to_num().floor().clamp(0, len(self.places) - 2)
-        part, base = column - base, base.long()
-        places = self.places.to(column)
-        return places[base] + part * (places[base + 1] - places[base])
+        base = column.nan_to_num().long().clamp_(0, len(self.places) - 2)  # towards zero: the first one below it
+        places, steps = (values.to(column) for values in (self.places, self.places.diff()))
+        return places[base].addcmul_(column - base, steps[base])
