@@ -13,8 +13,9 @@ from lsvision.report import Study, study_report
 from lsvision.schema import IntFrom2, Positive, PositiveInt, Text
 from lsvision.simulation import BoardPose
 from lsvision.stages.calibration.config import CalibrationConfig
+from lsvision.study.grid import study_points
 from lsvision.study.map import tilt_map
-from lsvision.study.points import Conditions, exact_corners, study_points
+from lsvision.study.points import Conditions, exact_corners
 from lsvision.study.runs import Sampling, run_points
 from lsvision.study.tables import iterations_table, points_table, runs_table
 from lsvision.types import Board, Rig

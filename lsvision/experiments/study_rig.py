@@ -12,7 +12,8 @@ from lsvision.report.rig_study_pages import rig_study_report
 from lsvision.schema import PositiveInt, Text
 from lsvision.stages.rig.config import RigConfig
 from lsvision.stages.rig.model import RigPrior
-from lsvision.study.rig_runs import RigSampling, rig_points, run_rigs
+from lsvision.study.grid import study_points
+from lsvision.study.rig_runs import RigSampling, run_rigs
 from lsvision.study.rig_scans import RigConditions
 from lsvision.types import Board
 
@@ -44,7 +45,7 @@ class StudyRigSettings(RunSettings):
 def run_study_rig(settings: StudyRigSettings, folder: Path) -> None:
     """Calibrate drawn rigs at every point; write the table, the summary and the report."""
     prior = RigPrior.of(settings.data_sheet.rig(), settings.estimate)
-    points = rig_points(settings.conditions, settings.axes)
+    points = study_points(settings.conditions, settings.axes)
     sampling = RigSampling(settings.runs, settings.seed)
     table = run_rigs(points, prior, settings.board, settings.estimate, sampling)
     write_parquet(table, folder / "points.parquet")

@@ -1,17 +1,15 @@
 """The points of a study: their conditions, and the exact corners of the boards under them."""
 
-import itertools
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, fields, replace
-from typing import Any
+from dataclasses import asdict, dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from lsvision.errors import ConfigError
-from lsvision.schema import AcuteAngle, Checked, NonNegative, OptionError, Positive, PositiveInt, Text
+from lsvision.schema import AcuteAngle, Checked, NonNegative, Positive, PositiveInt, Text
 from lsvision.simulation import Acquisition, BoardPose, MotionConfig, SceneConfig, SensorConfig, Simulation, simulate
 from lsvision.stages.calibration.config import CalibrationConfig
 from lsvision.stages.calibration.linearise import motion_information
@@ -82,28 +80,6 @@ class ExactCorners:
         """Largest angle between the normals of two boards; 0 where one tilt is repeated, or for one board."""
         normals = self.rotation[..., 2]
         return math.degrees(math.acos(min(1.0, float((normals @ normals.mT).min()))))
-
-
-def study_points(base: Conditions, axes: Mapping[str, Sequence[float | int | str] | None]) -> list[Conditions]:
-    """The grid of all axes, the last one fastest, over the base's conditions; an axis of None stays at its value.
-
-    Raises:
-        ConfigError: an axis that is no condition, is empty, or holds a value that the condition cannot have.
-    """
-    known = [item.name for item in fields(Conditions)]
-    varied = {name: values for name, values in axes.items() if values is not None}
-    for name, values in varied.items():
-        if name not in known:
-            raise ConfigError(f"axes.{name}: unknown; expected one of {', '.join(known)}")
-        if not values:
-            raise ConfigError(f"axes.{name}: the list is empty")
-    combinations: list[dict[str, Any]] = [
-        dict(zip(varied, values, strict=True)) for values in itertools.product(*varied.values())
-    ]
-    try:
-        return [replace(base, **values) for values in combinations]
-    except OptionError as error:
-        raise ConfigError(f"axes.{error.key}: {error.problem}") from error
 
 
 def exact_corners(

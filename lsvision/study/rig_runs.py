@@ -1,17 +1,13 @@
 """Many calibrations of simulated raw rigs: errors against what is stated, point by point."""
 
-import itertools
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, fields, replace
-from typing import Any
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
 
 import polars
 import torch
 
-from lsvision.errors import ConfigError
 from lsvision.geometry import ideal_rig, sharp_depth_mm
 from lsvision.report.progress import progress_bars
-from lsvision.schema import OptionError
 from lsvision.stages.rig.config import RigConfig
 from lsvision.stages.rig.height_shape import HeightShape
 from lsvision.stages.rig.model import SHARED, RigPrior, Shared
@@ -28,28 +24,6 @@ class RigSampling:
 
     runs: int
     seed: int = 0
-
-
-def rig_points(base: RigConditions, axes: Mapping[str, Sequence[float | int] | None]) -> list[RigConditions]:
-    """The grid of all axes, the last one fastest; an axis of None stays at its value.
-
-    Raises:
-        ConfigError: an axis that is no condition, is empty, or holds a value that the condition cannot have.
-    """
-    known = [item.name for item in fields(RigConditions)]
-    varied = {name: values for name, values in axes.items() if values is not None}
-    for name, values in varied.items():
-        if name not in known:
-            raise ConfigError(f"axes.{name}: unknown; expected one of {', '.join(known)}")
-        if not values:
-            raise ConfigError(f"axes.{name}: the list is empty")
-    grid: list[dict[str, Any]] = [
-        dict(zip(varied, values, strict=True)) for values in itertools.product(*varied.values())
-    ]
-    try:
-        return [replace(base, **values) for values in grid]
-    except OptionError as error:
-        raise ConfigError(f"axes.{error.key}: {error.problem}") from error
 
 
 def run_rigs(

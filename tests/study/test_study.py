@@ -18,12 +18,12 @@ from lsvision.simulation import BoardPose
 from lsvision.stages.calibration.calibrate import calibrate_batch
 from lsvision.stages.calibration.config import CalibrationConfig
 from lsvision.stages.calibration.model import squared_residuals, whitened_residuals
+from lsvision.study.grid import study_points
 from lsvision.study.map import tilt_map
 from lsvision.study.points import (
     Conditions,
     exact_corners,
     noise_chol,
-    study_points,
     true_information,
     true_problem,
 )
