@@ -25,7 +25,8 @@ from lsvision.image.tiling import HaloRange, halo_ranges, in_parallel
 _PATCH, _PATCH_SHARE = 5, 0.7  # px; unusable samples this dense are a saturated area, others are noise near white
 _SATURATED_SHARE = 0.002  # of the pixels of an image
 _SAMPLED, _MEAN_PX = 32, 9  # every so many lines are compared, by means over so many columns
-_OTHER_LIGHT, _OTHER_SHARE = 8.0, 0.1  # difference of grey values, of 255, and the share of the matched pixels
+# Difference of grey values, of 255, and the share of the matched pixels: photographs of boards reach 0.18.
+_OTHER_LIGHT, _OTHER_SHARE = 8.0, 0.25
 _NOISES = 4.0  # standard deviations of a mean over as many columns
 _TILE_LINES = 256  # stay in the processor's cache
 _APART = 4  # lines over which details along the scan are differences
