@@ -89,7 +89,7 @@ def options(annotation: Any, value: Any, path: tuple = ()) -> Iterator[tuple[tup
     shape = shape_of(annotation)
     if path:
         yield path, annotation
-    if shape.is_dataclass:
+    if shape.is_dataclass and value is not None:
         for name, hint in get_type_hints(shape.kind, include_extras=True).items():
             yield from options(hint, value[name], (*path, name))
     elif shape.kind in (list, tuple) and value:

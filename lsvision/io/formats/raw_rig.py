@@ -55,6 +55,11 @@ class RawRigEntries(Checked):
     color_spacing_lines: ColorSpacing | None = None
     sigma: dict[str, NonNegative] | None = None
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name in sorted(set(self.sigma or {}) - set(RIG_QUANTITIES)):
+            raise self.fault(f"sigma.{name}", f"unknown key; the quantities are {', '.join(RIG_QUANTITIES)}")
+
     def rig(self) -> RawRig:
         """The rig that they describe."""
         spacing = self.color_spacing_lines or ColorSpacing(0.0, 0.0, 0.0)
@@ -147,12 +152,6 @@ def raw_rig_from_dict(data: object, path: Path, where: str = "") -> RawRig:
     """Check the plain data of a raw rig and make the rig; see ``rig_from_dict``.
 
     Raises:
-        FileFormatError: an entry is missing, unknown or out of range; the cameras do not look at one point in front.
+        FileFormatError: an entry is missing, unknown or out of range.
     """
-    entries = read_entries(RawRigEntries, data, path, where)
-    unknown = set(entries.sigma or {}) - set(RIG_QUANTITIES)
-    if unknown:
-        raise FileFormatError(
-            path, f"unknown key; the quantities are {', '.join(RIG_QUANTITIES)}", f"sigma.{min(unknown)}"
-        )
-    return entries.rig()
+    return read_entries(RawRigEntries, data, path, where).rig()
