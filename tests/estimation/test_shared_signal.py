@@ -83,6 +83,7 @@ def test_expected_periodogram_equals_the_naive_mean() -> None:
         torch.testing.assert_close(found.expected(part)[2 * index][0], naive / power, rtol=1e-9, atol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_what_is_there_is_told_from_what_is_not(seed: int) -> None:
     a_alone, b_alone = (fit_shares(waves(200, *sizes, seed)[0], 1.0, 10.0) for sizes in ((1.0, 0.0), (0.0, 1.0)))

@@ -127,6 +127,7 @@ def test_one_board_is_called_prior_dominated(scans, command, tmp_path, capsys):
     assert "not measured" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_a_depth_map_scan_calibrates_too(scans, command, tmp_path):
     options = ("scale=8", "scene.pitch_deg=2", "scene.roll_deg=1.5", "depth=true", f"output={tmp_path / 'depth'}")
     assert command("+experiment=simulate", *options) == 0

@@ -18,6 +18,7 @@ def asked(tmp_path: Path, monkeypatch) -> tuple[str, ...]:
     return f"scan={scan}", f"calibration={calibration}", "disparity.halo_lines=8"
 
 
+@pytest.mark.slow
 @pytest.mark.drawn
 def test_all_that_it_writes(asked, command, tmp_path, capsys):
     assert command("+experiment=motion", *asked) == 0

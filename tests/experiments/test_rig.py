@@ -41,6 +41,7 @@ def test_files_hold_the_same_rig_with_its_covariance(command, scans, tmp_path, c
     assert (tmp_path / "run" / "report.html").stat().st_size > 1000
 
 
+@pytest.mark.slow
 def test_a_contradiction_is_an_exit_code_and_files(command, scans, tmp_path, monkeypatch, capsys):
     truth = Truth.drawn(1)
     n = truth.n[:, None].repeat(1, 3, 1)

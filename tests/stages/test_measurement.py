@@ -67,6 +67,7 @@ def test_no_board_measures_nothing():
     assert measure_board(blank, TensorImage(torch.zeros(200, 300, 1)), grid, BOARD) is None
 
 
+@pytest.mark.slow
 def test_chain_on_another_renderer(shared_data: Path):
     scans = tilt_scans(shared_data)
     calibration = calibrate(tilt_corners(shared_data), scans[0].rig, CalibrationConfig())

@@ -26,6 +26,7 @@ def corners_of(folder: Path, name: str) -> DetectedCorners:
     return detected
 
 
+@pytest.mark.slow
 def test_stereo_baseline_of_opencvs_photographs(shared_data: Path):
     folder = shared_data / "checkerboard_opencv_stereo"
     published = json.loads((folder / "bouguet_published_results.json").read_text())

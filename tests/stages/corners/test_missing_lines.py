@@ -11,6 +11,8 @@ from lsvision.stages.corners.find import find_corners
 from lsvision.types import BoardCorners, DepthView, Scan, StereoPair, TensorImage
 from tests.stages.rendered import BOARD, depth_scan, simulation, stereo_scan
 
+pytestmark = pytest.mark.slow  # boards are found many times
+
 
 @dataclass(frozen=True)
 class Lacking(TensorImage):

@@ -14,6 +14,8 @@ from lsvision.stages.corners.find import find_corners
 from lsvision.types import Board, BoardCorners, Scan, StereoPair, TensorImage
 from tests.stages.rendered import BOARD, FINE_SENSOR, PITCH, SMALL_RIG, simulation, stereo_scan, true_measurement
 
+pytestmark = pytest.mark.slow  # boards are found many times
+
 SQUARE_PX = 27
 
 

@@ -83,6 +83,7 @@ def test_corners_far_off_are_left_out():
     assert float((off / found.covariance.diagonal().sqrt()).abs().max()) < 4
 
 
+@pytest.mark.slow
 def test_scans_at_different_speeds_contradict_each_other():
     truth = Truth.drawn(1)
     n = truth.n[:, None].repeat(1, 8, 1)
@@ -93,6 +94,7 @@ def test_scans_at_different_speeds_contradict_each_other():
     assert found.reasons[1].startswith("without s0 the others agree to 1.0 sigmas")
 
 
+@pytest.mark.slow
 def test_more_noise_than_stated_makes_larger_sigmas():
     truth = Truth.drawn(1)
     found = solve_rig(truth.scanned(8, noise=2.0), PRIOR, CONFIG)
