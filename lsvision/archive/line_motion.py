@@ -208,12 +208,12 @@ def line_motion_metadata(motion: LineMotion, origin: Origin, travel: Travel) -> 
 
 
 def ambiguous_band(motion: LineMotion, advance_mm: float) -> tuple[float, float] | None:
-    """Shortest and longest wavelength, mm, of a motion that may be shape: none that the colours' lines have told."""
+    """Shortest and longest wavelength, mm, of a motion that may be shape, beyond those that colours separated."""
     bands = []
     for index, finding in enumerate(motion.findings):
-        band, told = band_of_power(motion.values[:, [index]], advance_mm), finding.told_up_to_mm or 0.0
-        if finding.component != "dy" and band is not None and band[1] > told:
-            bands.append((max(band[0], told), band[1]))
+        band, known = band_of_power(motion.values[:, [index]], advance_mm), finding.separated_up_to_mm or 0.0
+        if finding.component != "dy" and band is not None and band[1] > known:
+            bands.append((max(band[0], known), band[1]))
     return (min(band[0] for band in bands), max(band[1] for band in bands)) if bands else None
 
 

@@ -1,12 +1,12 @@
 """Estimation of Gaussian states: cubature regression, square-root filters, joint update, least squares, information.
 
 The calibration uses ``iterated_update``, ``filter_sequence``, ``levenberg_marquardt``, ``slr`` and the information of a
-posterior; the motion from line to line uses ``fit_signals`` and ``smooth_signals``, and with them ``matern``; to tell
-it from the object's shape, ``fit_shares`` and ``smooth_shares``, and with them ``oscillation`` and ``smooth``. The rest
-is library API for other models, which the package itself does not call: ``measurement`` and ``whitened_rows`` for the
-joint update, ``predict`` and ``update`` for filters, ``filter_signals`` in square-root form, ``recentre`` for rotations
-in a state, ``nis``, ``fisher_information`` and ``marginal_information`` for checks. ``linalg`` holds the matrix
-functions that all of them use, and the rule on bits.
+posterior; the motion from line to line uses ``fit_signals`` and ``smooth_signals``, and with them ``matern``; to
+separate it from the object's shape, ``fit_shares`` and ``smooth_shares``, and with them ``oscillation`` and ``smooth``.
+The rest is library API for other models, which the package itself does not call: ``measurement`` and ``whitened_rows``
+for the joint update, ``predict`` and ``update`` for filters, ``filter_signals`` in square-root form, ``recentre`` for
+rotations in a state, ``nis``, ``fisher_information`` and ``marginal_information`` for checks. ``linalg`` holds the
+matrix functions that all of them use, and the rule on bits.
 """
 
 from lsvision.estimation.bordered import BorderedFit, BorderedState, bordered_least_squares, shared_information

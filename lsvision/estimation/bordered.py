@@ -120,6 +120,7 @@ class _Step:
 
     @classmethod
     def of(cls, residual: Callable[[BorderedState], Tensor], state: BorderedState) -> "_Step":
+        """The step from a state, by a triangular root of all rows, those of the prior included."""
         own, shared = state.own.shape[-1], state.shared.shape[-1]
         roots = _roots(residual, state)
         eye = torch.eye(shared, dtype=state.shared.dtype, device=state.shared.device).expand(

@@ -26,7 +26,7 @@ class LineFinding:
     the travel over which it changes. ``evidence`` is how much better the data fit with the component than without, in
     units of the logarithm of the likelihood. ``reason`` says why nothing was observed, where that is not the object's
     shape. ``shape_rms`` is what the profile shows besides and belongs to the object's shape along its travel: it stays
-    in the height. Waves up to ``told_up_to_mm`` were told from such shape by the colours' lines.
+    in the height. Waves up to ``separated_up_to_mm`` were separated from such shape by the colours' lines.
     """
 
     component: LineComponent
@@ -37,7 +37,7 @@ class LineFinding:
     evidence: float = 0.0
     reason: str = "the object's shape does not show it"
     shape_rms: NonNegative = 0.0
-    told_up_to_mm: float | None = None
+    separated_up_to_mm: float | None = None
 
     @property
     def in_words(self) -> str:
@@ -51,8 +51,9 @@ class LineFinding:
             return f"{name}: not observed, {self.reason}{error}"
         length = "" if self.length_mm is None else f", over lengths of {self.length_mm:.2g} mm"
         known = f"known to {self.sigma * scale:.2g} {unit}" if self.sigma > 0 else "of unknown sigma"
-        told = "" if self.told_up_to_mm is None else f", told from shape up to waves of {self.told_up_to_mm:.3g} mm"
-        return f"{name}: {self.rms * scale:.2g} {unit} rms, {known}{length}{told}{shape}"
+        known_up_to = self.separated_up_to_mm
+        separated = "" if known_up_to is None else f", separated from shape up to waves of {known_up_to:.3g} mm"
+        return f"{name}: {self.rms * scale:.2g} {unit} rms, {known}{length}{separated}{shape}"
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ import math
 import statistics
 import tempfile
 import time
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -57,12 +57,21 @@ def shaken_rail(folder: Path, scale: int, lines: int) -> Simulation:
     return rail
 
 
-def corrected(folder: Path, processing: Processing, output: Path) -> tuple[Product, float, float]:
-    """The product, and the seconds and processor seconds that it took."""
+@dataclass(frozen=True)
+class Made:
+    """A product, and what it took: seconds by the clock and of the processor."""
+
+    product: Product
+    seconds: float
+    processor_seconds: float
+
+
+def corrected(folder: Path, processing: Processing, output: Path) -> Made:
+    """Correct the scan of a folder."""
     plan = plan_one(folder / "scan", folder / "n.json", processing)
     begin, used = time.perf_counter(), time.process_time()
     made = process_one(plan, processing, output, lambda task, outcome: None)
-    return read_product(made.path), time.perf_counter() - begin, time.process_time() - used
+    return Made(read_product(made.path), time.perf_counter() - begin, time.process_time() - used)
 
 
 def crown_rms_mm(product: Product) -> float:
@@ -116,12 +125,13 @@ def run(*, full: bool = False) -> dict[str, object]:
         corrected(first, with_motion, first / "o")  # what is imported and made once is not counted
         rail = shaken_rail(folder, scale, lines)
         for turn in range(turns):
-            still, *without = corrected(folder, WITHOUT, folder / f"without {turn}")
-            steadied, *measured = corrected(folder, with_motion, folder / f"with {turn}")
-            seconds.append((without[0], measured[0]))
-            processor.append((without[1], measured[1]))
-        crown = {"before": round(crown_rms_mm(still), 4), "after": round(crown_rms_mm(steadied), 4)}
-        errors = errors_of(steadied, rail)
+            still = corrected(folder, WITHOUT, folder / f"without {turn}")
+            steadied = corrected(folder, with_motion, folder / f"with {turn}")
+            seconds.append((still.seconds, steadied.seconds))
+            processor.append((still.processor_seconds, steadied.processor_seconds))
+        before, after = (round(crown_rms_mm(made.product), 4) for made in (still, steadied))
+        crown = {"before": before, "after": after}
+        errors = errors_of(steadied.product, rail)
     ratio = statistics.median(without / measured for without, measured in seconds)
     return {
         "unit": f"seconds for {lines} lines of {rail.rig.width_px} px, matched and corrected",

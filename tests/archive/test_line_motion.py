@@ -431,7 +431,7 @@ def test_what_the_colors_have_told_is_not_ambiguous():
 
     def band(*told):
         findings = tuple(
-            LineFinding(name, "corrected", 0.7, 0.1, told_up_to_mm=length)
+            LineFinding(name, "corrected", 0.7, 0.1, separated_up_to_mm=length)
             for name, length in zip(("dx", "dz"), told, strict=True)
         )
         motion = LineMotion(values, torch.zeros(2000, 4, 4, dtype=torch.float64), findings)

@@ -1,4 +1,4 @@
-"""Gloss: light that both cameras see at places of its own, and the detail of a surface that tells it from texture.
+"""Gloss: light that both cameras see at places of its own, and the detail by which a surface differs from it.
 
 The mirror image of a lamp lies behind the surface, or in front of a hollow one. On a surface without texture of its own
 its border is all that there is to match, and both cameras agree on the depth of the lamp's image. No test of a match

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float
@@ -14,7 +14,7 @@ from lsvision.geometry import sharp_depth_mm
 from lsvision.stages.calibration.batch import BatchCalibration, errors_along_scan_of, iterations_of
 from lsvision.stages.calibration.config import CalibrationConfig
 from lsvision.stages.calibration.exchanged import images_exchanged
-from lsvision.stages.calibration.findings import find_flaws
+from lsvision.stages.calibration.findings import Findings, find_flaws
 from lsvision.stages.calibration.hypotheses import Assumed
 from lsvision.stages.calibration.line_motion import FoundProcesses, line_motions
 from lsvision.stages.calibration.measurements import BoardMeasurements
@@ -48,24 +48,8 @@ def calibrate(
             covariances that are not finite or not positive definite (names the scan); no solution.
         ConfigError: a mounting pitch is given for more than one board.
     """
-    if not boards:
-        raise CalibrationError("no board scans to calibrate from")
-    measured = BoardMeasurements.of(boards)
-    for flaw, flawed in measured.flaws().items():
-        for board, bad in zip(boards, flawed.tolist(), strict=True):
-            if bad:
-                raise CalibrationError(f"{board.scan}: {flaw.value}")
-    solution = solve(measured, config)
-    assumed = Assumed(config.prior_sigma, config.board_scale_sigma)
-    shaken = bool(solution.along_scan.found)
-    findings = find_flaws(boards, solution.problem, solution.start, solution.outlying, assumed, shaken)
-    if findings.contradictions and shaken:  # they are no errors along the scan
-        solution = solve(measured, replace(config, correlated_odds=math.inf))
-        shaken = bool(solution.along_scan.found)
-    by_edges: tuple[str, ...] = ()
-    if shaken and edges is not None and config.corrects_lines:
-        by_corners, solution = solution, with_edges(solution, edges)
-        by_edges = _what_edges_did(by_corners, solution)
+    found = _explained(boards, edges, config)
+    solution, findings = found.solution, found.findings
     batch, scale = solution.summary(), float(solution.noise_scale)
     if int(batch.info) == Info.SINGULAR:
         raise CalibrationError(
@@ -97,11 +81,54 @@ def calibrate(
         rig=rig,
         verdict=judged.verdict,
         reasons=judged.reasons,
-        notes=(*findings.notes, *(by_edges if along_scan else findings.shake)),
+        notes=(*findings.notes, *(found.by_edges if along_scan else findings.shake)),
         converged=converged,
         noise_scale=scale,
         errors_along_scan=along_scan,
     )
+
+
+@dataclass(frozen=True)
+class _Explained:
+    """A solution with the cause that explains its residuals best, and what the edges did to it, in sentences."""
+
+    solution: Solution
+    findings: Findings
+    by_edges: tuple[str, ...] = ()
+
+
+def _explained(
+    boards: Sequence[BoardCorners], edges: Sequence[BoardEdges | None] | None, config: CalibrationConfig
+) -> _Explained:
+    """Solve, with errors along the scan only where no other cause explains the residuals, then with the edges."""
+    measured = _sound(boards)
+    solution = solve(measured, config)
+    assumed = Assumed(config.prior_sigma, config.board_scale_sigma)
+    shaken = bool(solution.along_scan.found)
+    findings = find_flaws(boards, solution.problem, solution.start, solution.outlying, assumed, shaken)
+    if findings.contradictions and shaken:  # they are no errors along the scan
+        solution = solve(measured, replace(config, correlated_odds=math.inf))
+        shaken = bool(solution.along_scan.found)
+    if not shaken or edges is None or not config.corrects_lines:
+        return _Explained(solution, findings)
+    by_edges = with_edges(solution, edges)
+    return _Explained(by_edges, findings, _what_edges_did(solution, by_edges))
+
+
+def _sound(boards: Sequence[BoardCorners]) -> BoardMeasurements:
+    """The corners of all boards.
+
+    Raises:
+        CalibrationError: there are none, or a board cannot be used; names the scan.
+    """
+    if not boards:
+        raise CalibrationError("no board scans to calibrate from")
+    measured = BoardMeasurements.of(boards)
+    for flaw, flawed in measured.flaws().items():
+        for board, bad in zip(boards, flawed.tolist(), strict=True):
+            if bad:
+                raise CalibrationError(f"{board.scan}: {flaw.value}")
+    return measured
 
 
 def calibrate_batch(

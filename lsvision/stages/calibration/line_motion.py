@@ -2,7 +2,7 @@
 
 It is published as ``LineMotion`` describes it: displaced by (δx, 0, δz) and rolled about c, travel beyond the nominal
 by δy. The mean over the scan belongs to the board's pose. What is linear along a scan is shared with n: one scan alone
-cannot tell them apart, several can, as they share n. So the values keep the trend by which a scan departs from n,
+cannot separate them, several can, as they share n. So the values keep the trend by which a scan departs from n,
 without which its board would stay sheared, and the covariance is that of what is not linear: n's covers the rest.
 """
 

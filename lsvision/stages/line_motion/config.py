@@ -23,8 +23,8 @@ class LineMotionConfig(Checked):
     for it to be corrected; and it must be ``least_ratio`` times the errors of a single line at least, as errors of the
     matching may last for many lines.
     Waves along the travel longer than ``shape_longer_than_mm`` count as the object's shape, as bow and corrugation, and
-    stay in the height: a profile alone does not tell them from vibration. null takes all for vibration but what the
-    lines of the colours tell.
+    stay in the height: a profile alone does not distinguish them from vibration. null takes all for vibration but
+    what the lines of the colours separate.
     Lines are smoothed in blocks of ``block_lines`` with ``halo_lines`` on either side.
     """
 

@@ -5,7 +5,7 @@
 3. Its displacements are smoothed, and those components kept that are there (``estimate``).
 
 A profile that changes along the object, as a bent, twisted or corrugated rail's, is the same signal as a motion. The
-lines of the colours, or a stated prior, tell them apart (``shape``).
+lines of the colours, or a stated prior, separate them (``shape``).
 """
 
 import math

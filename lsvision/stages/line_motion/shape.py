@@ -1,8 +1,8 @@
 """What of a measured motion is the object's own shape along its travel, and stays in the height.
 
-A profile shows δ(v) + s(v), the displacement of the object and its shape: corrugation, bow, twist. Two things tell
-them apart: a stated prior, that waves longer than ``shape_longer_than_mm`` are shape, and the colours of a trilinear
-sensor, which see differences of δ alone (``color_differences``). What neither tells is taken for motion.
+A profile shows δ(v) + s(v), the displacement of the object and its shape: corrugation, bow, twist. Two things
+separate them: a stated prior, that waves longer than ``shape_longer_than_mm`` are shape, and the colours of a trilinear
+sensor, which see differences of δ alone (``color_differences``). What neither separates is taken for motion.
 """
 
 import math
@@ -24,9 +24,9 @@ from lsvision.types import LineFinding, LineMotion
 _USUAL_LENGTH_MM = 20.0
 _BLOCK_KNOTS, _HALO_KNOTS = 512, 512
 _LEAST_KNOTS = 32
-_TOLD = 0.25  # error of a wave's amplitude over the rms of all, with which shape and motion are told apart
-_FEWEST_WAVES = 4.0  # of a scan: of fewer, one is not told from another
-_DOUBT = 3.0  # evidence for a shape, too little to find it, from which on nothing counts as told
+_SEPARATED = 0.25  # error of a wave's amplitude over the rms of all, with which shape and motion are separated
+_FEWEST_WAVES = 4.0  # of a scan: of fewer, one is not separated from another
+_DOUBT = 3.0  # evidence for a shape, too little to find it, from which on nothing counts as separated
 _ORDER = 4  # of the Butterworth filter that splits waves by length
 
 
@@ -75,11 +75,11 @@ def without_shape(motion: LineMotion, data: ShapeData, config: LineMotionConfig)
 
 @dataclass(frozen=True)
 class _Shape:
-    """Shape by line and its variance, up to which wavelength the colours tell it, and whether it is all there is."""
+    """Shape by line and its variance, up to which wavelength the colours show it, and whether it is all there is."""
 
     mean: Float[Tensor, " lines"]
     variance: Float[Tensor, " lines"]
-    told_up_to_mm: float | None = None
+    separated_up_to_mm: float | None = None
     is_all: bool = False
 
 
@@ -106,9 +106,9 @@ def _with_colors(
     """The shape with what the colours add to it."""
     rms = float(signal.total[signal.total_valid].std())
     fit = fit_shares(signal, rms, _USUAL_LENGTH_MM / (knots.size * pitch_mm))
-    shape = replace(shape, told_up_to_mm=told_up_to_mm(signal, knots, rms, pitch_mm))
+    shape = replace(shape, separated_up_to_mm=separated_up_to_mm(signal, knots, rms, pitch_mm))
     if not _is_there(fit, 1, signal, config):
-        return shape if fit.evidence[1] < _DOUBT else replace(shape, told_up_to_mm=None)
+        return shape if fit.evidence[1] < _DOUBT else replace(shape, separated_up_to_mm=None)
     if not _is_there(fit, 0, signal, config):
         return replace(shape, is_all=True)
     mean, variance = (
@@ -124,13 +124,13 @@ def _is_there(fit: SharedFit, which: int, signal: SharedSignal, config: LineMoti
     return fit.evidence[which] > config.evidence and large
 
 
-def told_up_to_mm(signal: SharedSignal, knots: Knots, rms: float, pitch_mm: float) -> float | None:
-    """Longest wavelength at which the colours tell a wave of the whole scan from shape; None where at none.
+def separated_up_to_mm(signal: SharedSignal, knots: Knots, rms: float, pitch_mm: float) -> float | None:
+    """Longest wavelength at which the colours separate a wave of the whole scan from shape; None where at none.
 
     A difference shows a wave of length λ, in knots, times 2 r sin(π / λ).
     """
     error = signal.difference_sigma * math.sqrt(2 / max(int(signal.difference_valid.sum()), 1))
-    needed = error / max(2 * abs(signal.ratio) * _TOLD * rms, 1e-12)
+    needed = error / max(2 * abs(signal.ratio) * _SEPARATED * rms, 1e-12)
     if needed >= 1:
         return None
     return min(math.pi / math.asin(needed), knots.count / _FEWEST_WAVES) * knots.size * pitch_mm
@@ -150,7 +150,7 @@ def longer_waves(values: Float[Tensor, " lines"], pitch_mm: float, longest_mm: f
 
 def _finding_with(finding: LineFinding, values: Tensor, shape: Tensor, of: _Shape) -> LineFinding:
     """What is known of a component whose shape was removed."""
-    finding = replace(finding, told_up_to_mm=of.told_up_to_mm)
+    finding = replace(finding, separated_up_to_mm=of.separated_up_to_mm)
     if of.is_all or _rms(values) <= finding.sigma:
         return replace(finding, state="absent", rms=0.0, length_mm=None, shape_rms=finding.rms)
     if not bool(shape.any()):

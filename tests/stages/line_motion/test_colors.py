@@ -151,7 +151,7 @@ def test_corrugation_stays_in_the_height_under_vibration(seed: int) -> None:
     assert (error / found.sigma[:, 1]).square().mean() < 3.0
     finding = found.findings[1]
     assert finding.shape_rms == pytest.approx(0.05 / math.sqrt(2), abs=0.006)
-    assert finding.told_up_to_mm > 100.0
+    assert finding.separated_up_to_mm > 100.0
     assert "are the object's shape" in finding.in_words
 
 
