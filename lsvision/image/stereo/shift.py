@@ -55,6 +55,7 @@ class LeftWindows:
     Args:
         noise: sigma of the noise of grey values.
         block: side of a block, px.
+        energy: mean squared slope of each block.
     """
 
     left: Float[Tensor, "lines width"]
@@ -62,6 +63,7 @@ class LeftWindows:
     windows: Windows
     noise: float
     block: int
+    energy: Float[Tensor, "rows columns"]
     mean_slope: Float[Tensor, "rows columns"]
     texture: Float[Tensor, "rows columns"]
     brightness: "Brightness | None"
@@ -75,10 +77,11 @@ class LeftWindows:
         # between its pixels: a slope that shared its noise would pull disparities towards the middle between them.
         slope = differences.slope(left)
         mean_slope = windows.mean(slope)
-        texture = windows.covariance(slope, slope, mean_slope, mean_slope)
+        energy = windows.reduced(slope * slope)
+        texture = windows.mean(energy).addcmul_(mean_slope, mean_slope, value=-1)
         brightness = Brightness.of(left, slope, mean_slope, windows) if with_gain else None
         block = left.shape[0] // windows.weight.shape[0]
-        return cls(left, slope, windows, noise, block, mean_slope, texture, brightness)
+        return cls(left, slope, windows, noise, block, energy, mean_slope, texture, brightness)
 
     @property
     def prior(self) -> float:

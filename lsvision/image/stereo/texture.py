@@ -64,12 +64,11 @@ def texture_support(
     curvature = second_difference(equations.left)
     by_curvature = mean(windows.reduced(curvature.square_())).mul_(_CURVATURE_NOISE)
     expected = torch.minimum(residual_variance * SLOPE_NOISE, by_curvature)
-    energy = windows.reduced(equations.slope * equations.slope)
     mean_slope = mean(equations.mean_slope)
-    texture = mean(energy).addcmul_(mean_slope, mean_slope, value=-1)
+    texture = mean(equations.energy).addcmul_(mean_slope, mean_slope, value=-1)
     chance = count.rsqrt_().mul_(confidence * _SPREAD**0.5 / block)
     proven = texture > chance.add_(1.0).mul_(expected)
-    return TextureSupport(proven, _variance_aside(energy.mul_(windows.weight), expected, equations))
+    return TextureSupport(proven, _variance_aside(equations.energy * windows.weight, expected, equations))
 
 
 def _variance_aside(energy: Tensor, noise: Tensor, equations: LeftWindows) -> Tensor:
