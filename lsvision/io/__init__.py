@@ -1,7 +1,7 @@
 """Files: rig, scan, calibration and product; read by line ranges, checked on reading, complete under a final name."""
 
 from lsvision.io.atomic import naming_full_disk, remove_partial_siblings, write_text
-from lsvision.io.formats.calibration import check_rig_match, read_calibration, write_calibration
+from lsvision.io.formats.calibration import read_calibration, write_calibration
 from lsvision.io.formats.checksum import scan_sha256
 from lsvision.io.formats.encoder import read_encoder, write_encoder
 from lsvision.io.formats.line_motion import read_line_motion, write_line_motion
@@ -15,6 +15,7 @@ from lsvision.io.formats.raw_rig import (
 )
 from lsvision.io.formats.rig import read_rig, rig_from_dict, rig_to_dict, write_rig
 from lsvision.io.formats.rig_calibration import write_rig_calibration
+from lsvision.io.formats.rig_match import check_rig_match
 from lsvision.io.formats.scan import NewScan, read_scan, scan_files, write_scan
 from lsvision.io.images.line_image import open_line_image
 from lsvision.io.images.tiff import write_line_image

@@ -22,6 +22,7 @@ from lsvision.types.calibration import (
     Verdict,
     WhetherLineMotion,
 )
+from lsvision.types.installation import Installation, InstallationVerdict, LinePitch, PointShift, Turn
 from lsvision.types.line_motion import LINE_COMPONENTS, LineComponent, LineFinding, LineMotion
 from lsvision.types.product import (
     ProductGrid,
@@ -60,15 +61,19 @@ __all__ = [
     "DepthSource",
     "DepthView",
     "ErrorAlongScan",
+    "Installation",
+    "InstallationVerdict",
     "Iteration",
     "LineComponent",
     "LineFinding",
     "LineImage",
     "LineMotion",
+    "LinePitch",
     "MissingLines",
     "Motion",
     "Observability",
     "ObservedDirection",
+    "PointShift",
     "Pose",
     "ProductGrid",
     "ProductStrip",
@@ -87,6 +92,7 @@ __all__ = [
     "TensorImage",
     "Transport",
     "Travel",
+    "Turn",
     "Verdict",
     "ViewPlane",
     "WhetherLineMotion",
