@@ -15,7 +15,7 @@ from lsvision.io.formats.raw_rig import (
 )
 from lsvision.io.formats.rig import read_rig, rig_from_dict, rig_to_dict, write_rig
 from lsvision.io.formats.rig_calibration import write_rig_calibration
-from lsvision.io.formats.rig_match import check_rig_match
+from lsvision.io.formats.rig_match import check_rig_match, rig_difference
 from lsvision.io.formats.scan import NewScan, read_scan, scan_files, write_scan
 from lsvision.io.images.line_image import open_line_image
 from lsvision.io.images.tiff import write_line_image
@@ -59,6 +59,7 @@ __all__ = [
     "read_rig_pair",
     "read_scan",
     "remove_partial_siblings",
+    "rig_difference",
     "rig_from_dict",
     "rig_to_dict",
     "scan_files",
