@@ -1,12 +1,19 @@
 """Corners in both raw images of board scans -> a calibrated rig: its quantities, what is known of them, what to do."""
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import torch
+from torch import Tensor
 
 from lsvision.errors import CalibrationError
-from lsvision.geometry import RawPair, ideal_rig, rotation_from_vector, sharp_depth_mm, with_quantities
+from lsvision.geometry import (
+    RawPair,
+    ideal_rig,
+    rotation_from_vector,
+    sharp_depth_mm,
+    with_covariance,
+    with_quantities,
+)
 from lsvision.stages.rig.advice import next_scan
 from lsvision.stages.rig.config import RigConfig
 from lsvision.stages.rig.height_shape import HeightShape
@@ -54,12 +61,12 @@ def calibrate_rig(sightings: Sightings, scans: Sequence[str], rig: RawRig, confi
     bending = [combination for combination in weak if combination.bend_um >= config.least_height_um]
     if bending and not reasons:
         reasons = [*_left_to_the_data_sheet(bending), advice]
-    sigma = solution.covariance.diagonal().sqrt().tolist()
     found = with_quantities(rig, shared.quantities)
+    covariance = _about_own_depth(solution.covariance, rig, found)
     return RigCalibration(
-        rig=replace(found, sigma=tuple(zip(RIG_QUANTITIES, sigma[:QUANTITIES], strict=True))),
-        motion=Motion(shared.n, solution.covariance[QUANTITIES:, QUANTITIES:]),
-        covariance=solution.covariance,
+        rig=with_covariance(found, covariance[:QUANTITIES, :QUANTITIES]),
+        motion=Motion(shared.n, covariance[QUANTITIES:, QUANTITIES:]),
+        covariance=covariance,
         boards=_boards(solution, scans, held_out),
         residuals=_residuals(solution),
         noise_scale=float(solution.noise_scale),
@@ -69,6 +76,16 @@ def calibrate_rig(sightings: Sightings, scans: Sequence[str], rig: RawRig, confi
         verdict=_verdict(solution, bool(bending)),
         reasons=tuple(reasons),
     )
+
+
+def _about_own_depth(covariance: Tensor, start: RawRig, found: RawRig) -> Tensor:
+    """Covariance of a rig whose plane counts depth from its own z0, from that of one that does from the start's."""
+    moved = RawPair.of(found).z0_mm - RawPair.of(start).z0_mm
+    change = torch.eye(len(covariance), dtype=covariance.dtype)
+    offset, slope = (RIG_QUANTITIES.index(f"right.view_plane.{name}") for name in ("offset_mm", "slope_z"))
+    change[offset, slope] = moved
+    both = change @ covariance @ change.mT
+    return (both + both.mT) / 2
 
 
 def _verdict(solution: RigSolution, bending: bool) -> RigVerdict:
