@@ -1,7 +1,7 @@
 """Files: rig, scan, calibration and product; read by line ranges, checked on reading, complete under a final name."""
 
 from lsvision.io.atomic import naming_full_disk, remove_partial_siblings, write_text
-from lsvision.io.formats.calibration import check_rig_match, read_calibration, write_calibration
+from lsvision.io.formats.calibration import read_calibration, write_calibration
 from lsvision.io.formats.checksum import scan_sha256
 from lsvision.io.formats.encoder import read_encoder, write_encoder
 from lsvision.io.formats.line_motion import read_line_motion, write_line_motion
@@ -16,6 +16,7 @@ from lsvision.io.formats.raw_rig import (
 from lsvision.io.formats.response import read_response, write_response, write_rig_with_response
 from lsvision.io.formats.rig import read_rig, rig_from_dict, rig_to_dict, write_rig
 from lsvision.io.formats.rig_calibration import write_rig_calibration
+from lsvision.io.formats.rig_match import check_rig_match
 from lsvision.io.formats.scan import NewScan, read_scan, write_scan
 from lsvision.io.formats.scan_files import rig_file, scan_files
 from lsvision.io.images.line_image import open_line_image

@@ -22,6 +22,7 @@ from lsvision.types.calibration import (
     Verdict,
     WhetherLineMotion,
 )
+from lsvision.types.installation import Installation, InstallationVerdict, LinePitch, PointShift, Turn
 from lsvision.types.line_motion import LINE_COMPONENTS, LineComponent, LineFinding, LineMotion
 from lsvision.types.product import (
     ProductGrid,
@@ -62,15 +63,19 @@ __all__ = [
     "DepthSource",
     "DepthView",
     "ErrorAlongScan",
+    "Installation",
+    "InstallationVerdict",
     "Iteration",
     "LineComponent",
     "LineFinding",
     "LineImage",
     "LineMotion",
+    "LinePitch",
     "MissingLines",
     "Motion",
     "Observability",
     "ObservedDirection",
+    "PointShift",
     "Pose",
     "ProductGrid",
     "ProductStrip",
@@ -89,6 +94,7 @@ __all__ = [
     "TensorImage",
     "Transport",
     "Travel",
+    "Turn",
     "Verdict",
     "ViewPlane",
     "WhetherLineMotion",
