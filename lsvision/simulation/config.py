@@ -3,9 +3,11 @@
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
-from annotated_types import Ge, Lt
+from annotated_types import Ge, Le, Lt
 
 from lsvision.schema import AcuteAngle, Checked, NonNegative, Positive, PositiveInt, Seed, Share, Wavelengths
+
+Lights = Literal["beside", "along"]
 
 
 @dataclass(frozen=True)
@@ -21,6 +23,10 @@ class SceneConfig(Checked):
 
     A ``white`` reference is an endless white plane along the motion at that depth, with specks of dirt of about
     ``dirt_mm`` on ``dirt_share`` of it; ``dark`` is a scan without light. Their length is ``rail_length_mm``, too.
+
+    ``lights`` stand ``beside`` the cameras, parallel to the motion, or ``along`` the sensor line, as on machines. Steel
+    of ``rail_gloss`` reflects them besides, each by that share of a white surface's brightness at most, the more
+    narrowly the larger ``rail_sharpness``: each camera sees the reflections at other places.
     """
 
     kind: Literal["board", "sheet", "rail", "white", "dark"] = "board"
@@ -45,6 +51,9 @@ class SceneConfig(Checked):
     conveyor_drop_mm: float = 26.0  # of the conveyor under the plane of zero disparity
     dirt_share: Share = 0.02  # of a white reference
     dirt_mm: Positive = 1.5
+    lights: Lights = "beside"
+    rail_gloss: NonNegative = 0.0  # 0: matt
+    rail_sharpness: Positive = 60.0
     seed: Seed = 0
 
     def __post_init__(self) -> None:
@@ -85,6 +94,9 @@ class SensorConfig(Checked):
     A raw code is ``gain`` times that of an even camera, plus an offset. The gain falls off along the line by
     ``vignetting`` from its middle to its ends, by the square of the distance; every column and colour departs from that
     by ``gain_noise``, and from ``offset`` by ``offset_noise`` (standard deviations).
+
+    Lenses are in focus ``focus_height_mm`` over the plane of zero disparity, positive towards the cameras. A point that
+    lies off by 1 mm is blurred by ``defocus_px_per_mm`` (standard deviation) besides, up to 3 px.
     """
 
     noise: NonNegative = 1.5  # standard deviation, of 255
@@ -98,6 +110,8 @@ class SensorConfig(Checked):
     gain_noise: Annotated[float, Ge(0), Lt(0.2)] = 0.0  # relative
     offset: NonNegative = 0.0  # grey values, of 255
     offset_noise: NonNegative = 0.0
+    defocus_px_per_mm: NonNegative = 0.0
+    focus_height_mm: float = 0.0
     seed: Seed = 0
 
     @property
@@ -111,13 +125,15 @@ class EncoderConfig(Checked):
     """Unevenly triggered lines and the encoder's log of their positions.
 
     If ``enabled``, the true nominal position of a line swings by ``wobble_mm`` (rms) about the constant pitch. The log
-    is the true position plus white noise of ``noise_mm``.
+    is that position plus white noise of ``noise_mm``. Whether or not it is enabled, every line is triggered off its
+    place by a ``jitter`` (rms, as a share of the line pitch) that no log shows.
     """
 
     enabled: bool = False
     wobble_mm: NonNegative = 0.3
     wobble_wavelengths_mm: Wavelengths = (390.0, 151.0)
     noise_mm: NonNegative = 0.002
+    jitter: Annotated[float, Ge(0), Le(0.2)] = 0.0
     seed: Seed = 0
 
 

@@ -42,7 +42,7 @@ def scene_lines(board: Board, scene: SceneConfig, n: Tensor, line_pitch_mm: floa
 
 def build_scene(rig: Rig, board: Board, scene: SceneConfig, pose: Pose, n: Tensor) -> Scene:
     """Target, conveyor and lights; conveyor and rail run along the motion n."""
-    lighting = line_lights(rig)
+    lighting = line_lights(rig, scene.lights)
     ground = middle_point(rig) + scene.conveyor_drop_mm * _height_axis(n)
     conveyor = Conveyor(Pose(aligned_rotation(n), ground), lighting, scene.texture_mm, scene.seed)
     if scene.kind == "board":
