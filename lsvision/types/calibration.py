@@ -8,6 +8,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from lsvision.schema import NonNegative, Positive
+from lsvision.types.installation import Installation
 from lsvision.types.line_motion import LineFinding, LineMotion
 from lsvision.types.scan import Rig
 
@@ -187,7 +188,7 @@ class Calibration:
     ``noise_scale`` is how many times larger than the corners' given covariance their residuals are, 1 where they are as
     expected; the covariance of n allows for it, and for the ``errors_along_scan`` that the residuals show.
     ``line_motions`` are these line by line, for every board's scan, and empty where they are not part of the result;
-    the RMSE after is then without them.
+    the RMSE after is then without them. ``installation`` is how to align the cameras; None where n is not usable.
     """
 
     method: CalibrationMethod
@@ -205,6 +206,7 @@ class Calibration:
     noise_scale: float = 1.0
     errors_along_scan: tuple[ErrorAlongScan, ...] = ()
     line_motions: tuple[LineMotion, ...] = ()
+    installation: Installation | None = None
     provenance: Provenance = field(default_factory=lambda: Provenance("", ""))
 
     @property

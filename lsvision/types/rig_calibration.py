@@ -7,6 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lsvision.types.calibration import Motion, Pose, Provenance
+from lsvision.types.installation import Installation
 from lsvision.types.raw_rig import RawRig
 
 RigVerdict = Literal["determined", "prior-dominated", "inconsistent", "not converged"]
@@ -65,7 +66,7 @@ class RigCalibration:
     ``covariance`` is of ``RIG_QUANTITIES``, in the units of the rig's file, and of n after them. ``noise_scale`` is how
     many times larger than stated the corners' errors are. ``height_error_um`` is how far, rms, the heights of the
     field may be bent by what is not known of the rig. ``unobserved`` are the combinations that the prior says more of
-    than the scans.
+    than the scans. ``installation`` is how to align the cameras; None where n is not usable.
     """
 
     rig: RawRig
@@ -79,6 +80,7 @@ class RigCalibration:
     advice: str
     verdict: RigVerdict
     reasons: tuple[str, ...] = ()
+    installation: Installation | None = None
     provenance: Provenance = field(default_factory=lambda: Provenance("", ""))
 
     @property

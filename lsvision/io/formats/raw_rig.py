@@ -11,7 +11,7 @@ import yaml
 from lsvision.errors import FileFormatError
 from lsvision.geometry import ideal_rig
 from lsvision.io.atomic import write_text
-from lsvision.io.formats.rig import RIG_FORMAT, ColorSpacing, rig_from_dict
+from lsvision.io.formats.rig import RIG_FORMAT, ColorSpacing, ResponseFiles, RigEntries
 from lsvision.io.formats.validation import read_entries, read_yaml
 from lsvision.schema import AcuteAngle, Checked, NonNegative, Positive, PositiveInt, shown
 from lsvision.types import RIG_QUANTITIES, RawCamera, RawRig, Rig, ViewPlane
@@ -54,6 +54,7 @@ class RawRigEntries(Checked):
     right: RightCameraEntries
     color_spacing_lines: ColorSpacing | None = None
     sigma: dict[str, NonNegative] | None = None
+    response: ResponseFiles | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -77,10 +78,14 @@ class RawRigEntries(Checked):
 
 @dataclass(frozen=True)
 class RigPair:
-    """The pair of a rig file; where that holds a raw one, ``rig`` is the ideal pair that follows from it."""
+    """The pair of a rig file; where that holds a raw one, ``rig`` is the ideal pair that follows from it.
+
+    ``response`` are the files of the cameras' responses by camera, as the rig file names them.
+    """
 
     rig: Rig
     raw: RawRig | None
+    response: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def image_width_px(self) -> int:
@@ -98,15 +103,17 @@ def read_rig_pair(path: Path | str) -> RigPair:
     data = read_yaml(path)
     format_ = data.get("format") if isinstance(data, Mapping) else None
     if format_ == RAW_RIG_FORMAT:
-        raw = raw_rig_from_dict(data, path)
+        of_raw = read_entries(RawRigEntries, data, path)
+        raw = of_raw.rig()
         try:
-            return RigPair(ideal_rig(raw), raw)
+            return RigPair(ideal_rig(raw), raw, of_raw.response.named if of_raw.response else {})
         except ValueError as error:
             raise FileFormatError(path, str(error)) from None
     if format_ is not None and format_ != RIG_FORMAT:
         problem = f"expected {RIG_FORMAT} or {RAW_RIG_FORMAT}, got {shown(format_)}"
         raise FileFormatError(path, problem, "format")
-    return RigPair(rig_from_dict(data, path), None)
+    entries = read_entries(RigEntries, data, path)
+    return RigPair(entries.rig(), None, entries.response.named if entries.response else {})
 
 
 def read_raw_rig(path: Path | str) -> RawRig:

@@ -60,7 +60,7 @@ def test_file_has_the_documented_keys(tmp_path: Path, calibration: Calibration) 
             "rmse_after_mm",
             "improvement",
         ),
-        *("iterations", "boards", "observability", "rig", "provenance"),
+        *("iterations", "boards", "observability", "installation", "rig", "provenance"),
     ]
     assert list(data["motion"]) == ["n", "stretch", "angles_deg", "covariance", "sigma"]
     assert data["motion"]["stretch"] == pytest.approx(math.sqrt(1.05))
