@@ -16,6 +16,7 @@ from lsvision.io.formats.raw_rig import (
 from lsvision.io.formats.rig import read_rig, rig_from_dict, rig_to_dict, write_rig
 from lsvision.io.formats.rig_calibration import write_rig_calibration
 from lsvision.io.formats.scan import NewScan, read_scan, scan_files, write_scan
+from lsvision.io.formats.section import read_section
 from lsvision.io.images.line_image import open_line_image
 from lsvision.io.images.tiff import write_line_image
 from lsvision.io.json_file import finite_or_null, write_json
@@ -57,6 +58,7 @@ __all__ = [
     "read_rig",
     "read_rig_pair",
     "read_scan",
+    "read_section",
     "remove_partial_siblings",
     "rig_from_dict",
     "rig_to_dict",

@@ -45,6 +45,7 @@ from lsvision.types.scan import (
     Travel,
     missing_ranges,
 )
+from lsvision.types.section import Section, SectionFit
 
 __all__ = [
     "LINE_COMPONENTS",
@@ -82,6 +83,8 @@ __all__ = [
     "RigCombination",
     "RigVerdict",
     "Scan",
+    "Section",
+    "SectionFit",
     "StereoPair",
     "StoredDepth",
     "TensorImage",
