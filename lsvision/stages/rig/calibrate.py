@@ -20,6 +20,7 @@ from lsvision.stages.rig.height_shape import HeightShape
 from lsvision.stages.rig.held_out import FEWEST_BOARDS, HeldOut
 from lsvision.stages.rig.model import QUANTITIES, RigPrior
 from lsvision.stages.rig.observability import unobserved
+from lsvision.stages.rig.shaken import allow_for_line_motion
 from lsvision.stages.rig.sightings import CameraSighting, Sightings
 from lsvision.stages.rig.solve import RigSolution, solve_rig
 from lsvision.types import (
@@ -47,7 +48,8 @@ def calibrate_rig(sightings: Sightings, scans: Sequence[str], rig: RawRig, confi
         CalibrationError: the corners do not determine the boards' poses.
     """
     prior = RigPrior.of(rig, config)
-    solution = solve_rig(sightings, prior, config)
+    shaken = allow_for_line_motion(solve_rig(sightings, prior, config), config)
+    solution = shaken.solution
     shared = solution.shared
     if not bool(shared.vector.isfinite().all() & solution.found.factor.isfinite().all()):
         raise CalibrationError(f"{', '.join(scans)}: the corners do not determine the boards' poses")
@@ -55,7 +57,7 @@ def calibrate_rig(sightings: Sightings, scans: Sequence[str], rig: RawRig, confi
     shape = HeightShape.of(rig, shared, prior.sigma, depth_range_mm)
     weak = unobserved(solution.whitened_covariance, shape, config.observed_share)
     advice = next_scan(solution, shape, depth_range_mm).in_words
-    enough = config.held_out and solution.sightings.boards >= FEWEST_BOARDS
+    enough = config.held_out and solution.sightings.boards >= FEWEST_BOARDS and not shaken.errors
     held_out = HeldOut.of(solution, config) if enough else None
     reasons = [*_faults(solution), *_contradicting(solution, scans, held_out)]
     bending = [combination for combination in weak if combination.bend_um >= config.least_height_um]
@@ -75,6 +77,7 @@ def calibrate_rig(sightings: Sightings, scans: Sequence[str], rig: RawRig, confi
         advice=advice,
         verdict=_verdict(solution, bool(bending)),
         reasons=tuple(reasons),
+        errors_along_scan=shaken.errors,
     )
 
 
