@@ -11,7 +11,7 @@ import torch
 
 from lsvision.archive import calibration_for, measured_line_motion, read_calibrations
 from lsvision.archive.depth_store import create_depth_store, open_depth_store, write_depth
-from lsvision.archive.line_motion import line_motion_metadata, measured_travel
+from lsvision.archive.line_motion import line_motion_metadata, section_of
 from lsvision.experiments.settings import RunSettings
 from lsvision.geometry import ProductFrame, object_pitch_mm
 from lsvision.image.tiling import keep_freed_memory
@@ -46,6 +46,7 @@ class MotionSettings(RunSettings):
 
 def run_motion(settings: MotionSettings, folder: Path) -> None:
     """Measure the motion; write ``line_motion.parquet``, ``summary.json`` and the report."""
+    section = section_of(settings.registration)
     scan = read_scan(settings.scan, repair_encoder=settings.repair_encoder, missing_lines=settings.missing_lines)
     dated = calibration_for(scan, read_calibrations(settings.calibration, settings.accept))
     if dated.warning:
@@ -53,8 +54,8 @@ def run_motion(settings: MotionSettings, folder: Path) -> None:
     keep_freed_memory()
     matched = depth_of(scan, settings.disparity, n=dated.calibration.motion.n)
     with _stored_depth(scan, matched, settings.disparity, folder) as depth:
-        motion = measured_line_motion(scan, depth, dated.calibration.motion, settings.registration)
-        travel = measured_travel(scan, depth, dated.calibration.motion, settings.registration)
+        measured = measured_line_motion(scan, depth, dated.calibration.motion, settings.registration, section)
+        motion, travel = measured.motion, measured.travel
         still = ProductFrame(scan.rig, scan.travel, dated.calibration.motion.n)
         steadied = ProductFrame(scan.rig, scan.travel, still.n, None if motion.is_still else motion)
         lines = _spread_lines(scan.lines)
