@@ -15,11 +15,21 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from lsvision.geometry import ProductFrame, color_shift, depth_step_mm, middle_point, object_pitch_mm, travel_at
+from lsvision.geometry import (
+    ProductFrame,
+    color_shift,
+    depth_step_mm,
+    middle_point,
+    object_pitch_mm,
+    project,
+    shaken,
+    slope_at,
+    travel_at,
+)
 from lsvision.stages.disparity.config import DisparityConfig
 from lsvision.stages.disparity.depth import relation_of_scan
 from lsvision.stages.line_motion.color_differences import measure_color_differences
-from lsvision.stages.line_motion.color_pair import ColorPair, ObjectDepth, color_pair
+from lsvision.stages.line_motion.color_pair import ColorPair, ObjectPlace, color_pair
 from lsvision.stages.line_motion.color_travel import ColorTravel, measure_color_travel, with_travel
 from lsvision.stages.line_motion.config import LineMotionConfig
 from lsvision.stages.line_motion.errors import ErrorSums, LineErrors
@@ -77,7 +87,7 @@ def measure_line_motion(
         estimate(lines, shown.samples, along, errors, config),
         noisy_values(lines, shown.samples, config).valid,
     )
-    pair = _colors(scan, frame, shown.depth(lines.values[:, 1] * valid))
+    pair = _colors(scan, frame, shown.place(lines.values[:, 1] * valid, found, frame))
     if not found.is_still:
         columns = shown.reference, shown.columns
         differences = None if pair is None else measure_color_differences(pair, depth, lines, columns, config)
@@ -100,10 +110,13 @@ class _Shown:
     z: Float[Tensor, " columns"]
     section: SectionFit | None = None
 
-    def depth(self, moved_mm: Float[Tensor, " lines"]) -> ObjectDepth:
-        """Of the object whose lines are displaced so far."""
+    def place(self, deeper_mm: Float[Tensor, " lines"], motion: LineMotion, frame: ProductFrame) -> ObjectPlace:
+        """Of the object whose lines lie so much deeper, and are displaced by a motion."""
         middle = float(self.z.nanmean())
-        return ObjectDepth(middle + moved_mm, (self.z - middle).nan_to_num())
+        column = (self.columns.start + self.columns.stop - 1) / 2
+        still = motion.values.new_tensor([slope_at(frame.rig, column) * middle, middle]).expand(motion.lines, 2)
+        seen, _ = project(frame.rig, *shaken(still, motion.values, middle_point(frame.rig)).unbind(-1))
+        return ObjectPlace(middle + deeper_mm, (self.z - middle).nan_to_num(), seen - column)
 
     def on_section(self, section: Section, config: LineMotionConfig) -> "_Shown":
         """With a section in place of the profile, where it is one of it."""
@@ -186,11 +199,11 @@ def _registered(
     return lines, ErrorSums.total(sums)
 
 
-def _colors(scan: Scan, frame: ProductFrame, depth: ObjectDepth) -> ColorPair | None:
+def _colors(scan: Scan, frame: ProductFrame, place: ObjectPlace) -> ColorPair | None:
     """The colours that look furthest apart; None where all colours look at one line."""
     if color_shift(scan) is None:
         return None
-    return color_pair(scan, frame, relation_of_scan(scan, DisparityConfig()), depth)
+    return color_pair(scan, frame, relation_of_scan(scan, DisparityConfig()), place)
 
 
 def _spread_lines(depth: DepthSource, count: int) -> Depth:
