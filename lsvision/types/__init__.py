@@ -22,12 +22,14 @@ from lsvision.types.calibration import (
     Verdict,
     WhetherLineMotion,
 )
+from lsvision.types.installation import Installation, InstallationVerdict, LinePitch, PointShift, Turn
 from lsvision.types.line_motion import LINE_COMPONENTS, LineComponent, LineFinding, LineMotion
 from lsvision.types.product import (
     ProductGrid,
     ProductStrip,
 )
 from lsvision.types.raw_rig import RIG_QUANTITIES, RawCamera, RawRig, ViewPlane
+from lsvision.types.response import CameraResponse
 from lsvision.types.rig_calibration import CameraResiduals, RigBoard, RigCalibration, RigCombination, RigVerdict
 from lsvision.types.scan import (
     Board,
@@ -57,19 +59,24 @@ __all__ = [
     "Calibration",
     "CalibrationMethod",
     "CameraResiduals",
+    "CameraResponse",
     "Depth",
     "DepthSource",
     "DepthView",
     "ErrorAlongScan",
+    "Installation",
+    "InstallationVerdict",
     "Iteration",
     "LineComponent",
     "LineFinding",
     "LineImage",
     "LineMotion",
+    "LinePitch",
     "MissingLines",
     "Motion",
     "Observability",
     "ObservedDirection",
+    "PointShift",
     "Pose",
     "ProductGrid",
     "ProductStrip",
@@ -90,6 +97,7 @@ __all__ = [
     "TensorImage",
     "Transport",
     "Travel",
+    "Turn",
     "Verdict",
     "ViewPlane",
     "WhetherLineMotion",

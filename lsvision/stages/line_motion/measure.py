@@ -97,6 +97,22 @@ def measure_line_motion(
     return LineMeasurement(replace(found, section=_placed_section(shown, lines.values[valid], errors, frame)), travel)
 
 
+def measure_travel(scan: Scan, depth: DepthSource, motion: Motion, config: LineMotionConfig) -> ColorTravel | None:
+    """How far the object advances from line to line, from the lines of the colours; None where all look at one line.
+
+    Lines are not registered for it: the object is taken at the mean depth of its profile.
+
+    Args:
+        depth: of the left image. motion: n of the calibration.
+    """
+    if color_shift(scan) is None:
+        return None
+    frame = ProductFrame(scan.rig, scan.travel, motion.n)
+    shown = _shown(frame, depth, config)
+    pair = None if shown is None else _colors(scan, frame, shown.depth(shown.z.new_zeros(depth.lines)))
+    return None if shown is None or pair is None else measure_color_travel(pair, shown.columns)
+
+
 @dataclass(frozen=True)
 class _Shown:
     """The reference profile, the columns that show it, and how many samples of a line usually take part.
