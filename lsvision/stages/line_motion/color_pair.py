@@ -13,11 +13,17 @@ from lsvision.types import LineImage, Scan, StereoPair
 
 
 @dataclass(frozen=True)
-class ObjectDepth:
-    """How far away the object is: ``lines_mm`` its middle on every line, ``beside_mm`` columns beyond the middle."""
+class ObjectPlace:
+    """Where the object is.
 
-    lines_mm: Float[Tensor, " lines"]
+    Attributes:
+        depth_mm: how far away its middle is, by line. beside_mm: how far beyond the middle each of its columns lies.
+        moved_px: by how many columns it stands beside its usual place, by line.
+    """
+
+    depth_mm: Float[Tensor, " lines"]
     beside_mm: Float[Tensor, " columns"]
+    moved_px: Float[Tensor, " lines"]
 
 
 @dataclass(frozen=True)
@@ -28,7 +34,7 @@ class ColorPair:
         relation: of the scan's two images.
         channels: of the colour that sees a piece of the object last, and of the one that sees it first.
         shift: lines by which each colour looks beyond green at z0, by channel.
-        depth: of the object, which the colours' lines look the further apart on the further away it is.
+        place: of the object; the further away it is, the further apart the colours' lines look.
     """
 
     scan: Scan
@@ -37,7 +43,7 @@ class ColorPair:
     relation: PairRelation
     channels: tuple[int, int]
     shift: Float[Tensor, " channels"]
-    depth: ObjectDepth
+    place: ObjectPlace
 
     @property
     def shift_mm(self) -> Sequence[float]:
@@ -52,12 +58,17 @@ class ColorPair:
     def taken(self) -> Float[Tensor, "2 lines"]:
         """The (fractional) lines on which the two colours saw what green saw on each line, at the depth of the line."""
         shift_mm = torch.tensor(self.shift_mm, dtype=torch.float64)
-        seen_at = self.frame.plane_y(shift_mm[:, None], self.depth.lines_mm)
+        seen_at = self.frame.plane_y(shift_mm[:, None], self.place.depth_mm)
         return self.frame.shifted_line(torch.arange(self.scan.lines, dtype=torch.float64), seen_at)
 
     def rows(self) -> Float[Tensor, "2 lines"]:
         """The (fractional) rows of the images that show it in the two colours."""
-        return self.taken() + registered_rows(self.scan, self.shift)[list(self.channels), None]
+        return self.taken() + self.registered[:, None]
+
+    @property
+    def registered(self) -> Float[Tensor, "2"]:
+        """Rows by which the camera has shifted the two colours."""
+        return registered_rows(self.scan, self.shift)[list(self.channels)]
 
     def left(self, channel: int, start: int, stop: int) -> Float[Tensor, "rows width"]:
         """One colour of some rows of the left image, of 255."""
@@ -73,7 +84,7 @@ class ColorPair:
         return 255.0 / self.relation.levels.white
 
 
-def color_pair(scan: Scan, frame: ProductFrame, relation: PairRelation | None, depth: ObjectDepth) -> ColorPair | None:
+def color_pair(scan: Scan, frame: ProductFrame, relation: PairRelation | None, place: ObjectPlace) -> ColorPair | None:
     """The two colours of a scan that look furthest apart; None where all look at one line, or nothing was matched.
 
     Nor are there any of a raw pair: its images show a column of the ideal pair elsewhere, and at another moment.
@@ -86,7 +97,7 @@ def color_pair(scan: Scan, frame: ProductFrame, relation: PairRelation | None, d
     channels = int(shift.argmin()), int(shift.argmax())
     if scan.travel.transport == "reverse":
         channels = channels[::-1]
-    return ColorPair(scan, scan.images, frame, relation, channels, shift, depth)
+    return ColorPair(scan, scan.images, frame, relation, channels, shift, place)
 
 
 def at_rows(values: Float[Tensor, "rows ..."], row: Float[Tensor, " lines"]) -> Float[Tensor, "lines ..."]:

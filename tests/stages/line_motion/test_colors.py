@@ -14,7 +14,7 @@ from lsvision.simulation.rail import corrugation_mm, crown_place
 from lsvision.simulation.trajectory import cast_rays
 from lsvision.stages.disparity.config import DisparityConfig
 from lsvision.stages.disparity.depth import MatchedDepth, relation_of_scan
-from lsvision.stages.line_motion.color_pair import ObjectDepth, at_rows, color_pair
+from lsvision.stages.line_motion.color_pair import ObjectPlace, at_rows, color_pair
 from lsvision.stages.line_motion.color_registration import register_color
 from lsvision.stages.line_motion.config import LineMotionConfig
 from lsvision.stages.line_motion.knots import Knots
@@ -111,7 +111,7 @@ def test_colors_show_what_moves_between_their_moments_and_no_shape(registered: b
     frame, depth = ProductFrame(scan.rig, scan.travel, source.trajectory.n), depth_of(scan)
     samples = LineSamples.of(depth.read(0, 200), frame, (-60.0, 60.0), slice(None))
     middle = samples.z[samples.z < zero_disparity_mm(scan.rig)].mean()
-    far = ObjectDepth(middle.expand(200), torch.zeros(scan.rig.width_px).double())
+    far = ObjectPlace(middle.expand(200), torch.zeros(scan.rig.width_px).double(), torch.zeros(200).double())
     pair = color_pair(scan, frame, relation_of_scan(scan, DisparityConfig()), far)
     assert pair.channels == (0, 2)
     start = torch.zeros(200, 3).double()
