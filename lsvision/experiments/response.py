@@ -4,12 +4,14 @@ import logging
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from typing import Any
 
 import polars
 import torch
 
 from lsvision import __version__
 from lsvision.errors import ConfigError, ResponseError
+from lsvision.experiments.archive_response import measure_archive
 from lsvision.experiments.settings import RunSettings, settings_sha256
 from lsvision.geometry import Camera
 from lsvision.io import (
@@ -23,9 +25,10 @@ from lsvision.io import (
 )
 from lsvision.report.response_pages import response_in_words, response_report
 from lsvision.schema import Text
+from lsvision.stages.response.archive import Offsets
 from lsvision.stages.response.config import ResponseConfig
 from lsvision.stages.response.measured import MeasuredResponse, evened
-from lsvision.stages.response.references import Reference, measure_references
+from lsvision.stages.response.references import Reference, measure_dark, measure_references
 from lsvision.stages.response.still import shared_structure
 from lsvision.types import LineImage, Scan, StereoPair
 
@@ -36,10 +39,16 @@ RESPONSE_FORMAT = "lsvision-response/1"
 
 @dataclass(frozen=True, kw_only=True)
 class ResponseSettings(RunSettings):
-    """Options of the experiment: the scans of a dark reference and of a white one that moves."""
+    """Options of the experiment: the scans of a dark reference and of a white one that moves, or an archive.
+
+    ``archive`` is a folder of scans, or what else ``reprocess`` takes, of which ``calibration`` has the motion; a dark
+    reference may go with it.
+    """
 
     dark: Text | None = None
     white: Text | None = None
+    archive: Text | None = None
+    calibration: Text | None = None
     estimate: ResponseConfig = field(default_factory=ResponseConfig)
 
 
@@ -49,25 +58,62 @@ def run_response(settings: ResponseSettings, folder: Path) -> None:
     Raises:
         ResponseError: the references cannot be used; says why.
     """
-    if settings.dark is None or settings.white is None:
-        raise ConfigError("dark, white: expected the scans of both references, dark=DIR white=DIR")
-    dark, white = (read_scan(path, as_taken=True) for path in (settings.dark, settings.white))
-    measured = measure_pair(dark, white, settings.estimate)
-    files = write_responses(measured, folder)
-    write_rig_with_response(rig_file(settings.white), folder / "rig.yaml", files)
-    scans = (settings.dark, settings.white)
+    if settings.archive is not None:
+        found = _from_archive(settings, folder)
+    elif settings.dark is not None and settings.white is not None:
+        dark, white = (read_scan(path, as_taken=True) for path in (settings.dark, settings.white))
+        measured = measure_pair(dark, white, settings.estimate)
+        found = Found("references", measured, [dark.path, white.path])
+    else:
+        raise ConfigError("dark, white: expected the scans of both references, dark=DIR white=DIR, or archive=DIR")
+    files = write_responses(found.measured, folder)
+    write_rig_with_response(rig_file(found.scans[-1]), folder / "rig.yaml", files)
     provenance = {
         "version": __version__,
         "config_sha256": settings_sha256(settings),
-        "scans": [{"path": path, "sha256": scan_sha256(read_scan(path).path)} for path in scans],
+        "scans": [{"path": str(path), "sha256": scan_sha256(path)} for path in found.scans],
     }
-    summary = {str(camera): summary_of(item) for camera, item in measured.items()}
-    data = {"format": RESPONSE_FORMAT, "method": "references", "files": files, **summary, "provenance": provenance}
-    write_json(folder / "response.json", data)
-    response_report(measured, "references", asdict(settings), folder)
-    for line in response_in_words(measured):
+    summary = {str(camera): summary_of(item) for camera, item in found.measured.items()}
+    data = {"format": RESPONSE_FORMAT, "method": found.method, "files": files, **summary, **found.limits}
+    write_json(folder / "response.json", {**data, "provenance": provenance})
+    response_report(found.measured, found.in_words, asdict(settings), folder)
+    for line in response_in_words(found.measured):
         log.info("%s", line)
-    log.info("wrote %s and %s: put them, with rig.yaml, beside the scans", *(folder / name for name in files.values()))
+    log.info(
+        "wrote %s: put them, with rig.yaml, beside the scans", " and ".join(str(folder / n) for n in files.values())
+    )
+
+
+@dataclass(frozen=True)
+class Found:
+    """What was measured: how, the responses by camera, the scans they come from, and what limits them, by name."""
+
+    method: str
+    measured: dict[Camera, MeasuredResponse]
+    scans: list[Path]
+    limits: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def in_words(self) -> str:
+        """How it was measured."""
+        if not self.limits:
+            return self.method
+        longest = self.limits["observed_px"]
+        return f"an archive: of waves up to {longest:.0f} columns; longer ones, as vignetting, are left as they are"
+
+
+def _from_archive(settings: ResponseSettings, folder: Path) -> Found:
+    if settings.archive is None or settings.calibration is None or settings.white is not None:
+        raise ConfigError("archive: expected calibration=FILE with it, dark=DIR or not, and no white reference")
+    config, offsets = settings.estimate, Offsets({})
+    if settings.dark is not None:
+        images = images_of(read_scan(settings.dark, as_taken=True))
+        dark = {camera: measure_dark(Reference(image, settings.dark), config) for camera, image in images.items()}
+        offsets = Offsets(dark)
+    found = measure_archive(settings.archive, settings.calibration, offsets, config, folder)
+    limits = {"observed_px": found.observed_px, "wander_px": found.wander_px}
+    log.info("gains of waves up to %.0f columns; longer ones, as vignetting, are left as they are", found.observed_px)
+    return Found("archive", found.measured, found.scans, limits)
 
 
 def measure_pair(dark: Scan, white: Scan, config: ResponseConfig) -> dict[Camera, MeasuredResponse]:

@@ -1,5 +1,6 @@
 """The report of measured responses."""
 
+import math
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -20,10 +21,11 @@ def response_in_words(measured: Mapping[Camera, MeasuredResponse]) -> list[str]:
     for camera, item in measured.items():
         seen = item.gain[~item.gain.isnan()]
         blind = f", {item.blind_columns} columns that do not see" if item.blind_columns else ""
+        noise = f"; noise {item.noise[0]:.2f} codes in the dark, {item.noise[1]:.2f} on white"
         lines.append(
             f"{camera} camera: gain {float(seen.min()):.3f}..{float(seen.max()):.3f}, known to "
-            f"{item.relative_sigma:.2%}; offset {float(item.offset.median()):.2f} codes; noise "
-            f"{item.noise[0]:.2f} codes in the dark, {item.noise[1]:.2f} on white{blind}"
+            f"{item.relative_sigma:.2%}; offset {float(item.offset.median()):.2f} codes"
+            f"{noise if math.isfinite(item.noise[0]) else ''}{blind}"
         )
     return lines
 

@@ -11,8 +11,9 @@ import yaml
 
 from lsvision.archive.identity import stamp_of
 from lsvision.io import NewScan, read_response, read_scan, write_scan
+from lsvision.stages.response.wander import WanderGains
 from lsvision.types import Travel
-from tests.archive.archives import RIG
+from tests.archive.archives import RIG, make_calibration, make_scan, shaken
 from tests.stages.response.references import WIDTH, make
 
 WIDE = RIG.__class__(**{**vars(RIG), "width_px": WIDTH})
@@ -77,6 +78,36 @@ def test_what_cannot_be_used_is_one_line(references, command, capsys):
     assert line.startswith(f"error: {dark}: left: is no brighter than the dark reference")
     assert command("+experiment=response", f"dark={dark}", f"white={white}", "estimate.blocks=1") == 1
     assert "estimate.blocks: expected a whole number >= 2, got 1" in capsys.readouterr().err
+
+
+def test_an_archive_that_cannot_be_used_is_one_line(command, tmp_path, capsys):
+    scan, calibration = make_scan(tmp_path / "scans" / "a", stereo=True), make_calibration(tmp_path / "n.json")
+    assert command("+experiment=response", f"archive={scan.parent}") == 1
+    assert "error: archive: expected calibration=FILE with it" in capsys.readouterr().err
+    assert command("+experiment=response", f"archive={scan.parent}", f"calibration={calibration}") == 1
+    (line,) = capsys.readouterr().err.splitlines()[-1:]
+    assert line.startswith("error: archive: ")
+    assert not (tmp_path / "run" / "left_response.tif").exists()
+
+
+def test_an_archive_whose_objects_wander(command, tmp_path, capsys, monkeypatch):
+    """Its command from end to end, with the motion and the gains of its scans given."""
+    scan, calibration = make_scan(tmp_path / "scans" / "a", stereo=True), make_calibration(tmp_path / "n.json")
+    gains = WanderGains(0.05 * torch.randn(64, 3, dtype=torch.float64), torch.full((64, 3), 1e-3), 40.0, 3.0)
+    monkeypatch.setattr(
+        "lsvision.experiments.archive_response.measured_line_motion", lambda scan, *_: shaken(scan.lines)
+    )
+    monkeypatch.setattr(
+        "lsvision.experiments.archive_response.gains_of_scan", lambda *_: {"left": gains, "right": gains}
+    )
+    assert command("+experiment=response", f"archive={scan.parent}", f"calibration={calibration}") == 0
+    assert "gains of waves up to 40 columns; longer ones, as vignetting, are left" in capsys.readouterr().out
+    data = json.loads((tmp_path / "run" / "response.json").read_text())
+    assert data["method"] == "archive"
+    assert (data["observed_px"], data["wander_px"]) == (40.0, {"a": 3.0})
+    written = read_response(tmp_path / "run" / "right_response.tif")
+    assert torch.allclose(written.gain, gains.log_gain.exp().float())
+    assert not bool(written.offset.any())
 
 
 def test_a_white_that_did_not_move_is_refused(command, tmp_path, capsys):

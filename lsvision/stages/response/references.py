@@ -78,6 +78,18 @@ def measure_references(dark: Reference, white: Reference, config: ResponseConfig
     return found
 
 
+def measure_dark(dark: Reference, config: ResponseConfig) -> Float[Tensor, "width channels"]:
+    """The offsets of one camera by a dark reference alone, codes.
+
+    Raises:
+        ResponseError: the reference cannot be one; says why.
+    """
+    codes = _read(dark, config)
+    offset = grouped_median(codes.codes)
+    _check_dark(dark, codes, offset)
+    return offset
+
+
 def _read(reference: Reference, config: ResponseConfig) -> ReferenceCodes:
     lines = reference.image.shape[0]
     if lines < config.least_lines:
