@@ -10,10 +10,10 @@ import numpy as np
 import torch
 import torch.nn.functional as F  # noqa: N812
 from jaxtyping import Bool, Float, Shaped
+from numpy.typing import NDArray
 from torch import Tensor
 
 from lsvision.image.brightness import gray, sampled_lines, white_level
-from lsvision.image.resampled import ResampledImage
 from lsvision.types import LineImage, StereoPair
 
 _NO_CODE = 2**32
@@ -63,13 +63,24 @@ class CameraLevels:
 
     def unusable(self, lines: Shaped[Tensor, "lines width channels"]) -> Bool[Tensor, "lines width"] | None:
         """Which samples are saturated or from a faulty column; None where none is. Green decides for all colours."""
-        codes = cv2.extractChannel(lines.numpy(), _deciding_channel(lines))
-        if codes.max() < min(self.plateau, *self.tops, _NO_CODE) and not bool(self.faulty.any()):
+        saturated = self._saturated(cv2.extractChannel(lines.numpy(), _deciding_channel(lines)))
+        if saturated is None and not bool(self.faulty.any()):
             return None
-        bad = codes >= min(self.plateau, np.iinfo(codes.dtype).max)
+        faulty = self.faulty.expand(lines.shape[:2])
+        return faulty.contiguous() if saturated is None else torch.from_numpy(saturated) | faulty
+
+    def saturated(self, lines: Shaped[Tensor, "lines width channels"]) -> Bool[Tensor, "lines width channels"] | None:
+        """Which samples are saturated, each colour by itself; None where none is."""
+        saturated = self._saturated(lines.numpy())
+        return None if saturated is None else torch.from_numpy(saturated)
+
+    def _saturated(self, codes: NDArray) -> NDArray[np.bool_] | None:
+        if codes.size == 0 or codes.max() < min(self.plateau, *self.tops, _NO_CODE):
+            return None
+        bad: NDArray[np.bool_] = codes >= min(self.plateau, np.iinfo(codes.dtype).max)
         for top in self.tops:
             bad |= codes == top
-        return torch.from_numpy(bad | self.faulty.numpy())
+        return bad
 
 
 @dataclass(frozen=True)
@@ -83,14 +94,15 @@ class PairLevels:
     @classmethod
     def of(cls, pair: StereoPair) -> "PairLevels":
         """Read the levels of both images."""
-        left, right = (_as_taken(image) for image in (pair.left, pair.right))
+        left, right = (as_taken(image) for image in (pair.left, pair.right))
         white = white_level(left, right)
         return cls(white, CameraLevels.of(left, white), CameraLevels.of(right, white))
 
 
-def _as_taken(image: LineImage) -> LineImage:
-    """An image as the camera took it: of codes that are interpolated nothing can be read."""
-    return image.source if isinstance(image, ResampledImage) else image
+def as_taken(image: LineImage) -> LineImage:
+    """An image as the camera delivered it: of codes that were interpolated or divided by a gain nothing can be read."""
+    source: LineImage | None = getattr(image, "source", None)
+    return image if source is None else as_taken(source)
 
 
 def _deciding_channel(values: Shaped[Tensor, "lines width channels"]) -> int:

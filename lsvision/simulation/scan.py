@@ -15,15 +15,16 @@ from lsvision.schema import Checked, Positive, PositiveInt
 from lsvision.simulation.config import EncoderConfig, MotionConfig, SceneConfig, SensorConfig
 from lsvision.simulation.noise import lattice_hash
 from lsvision.simulation.scene import build_scene, place, scene_lines
-from lsvision.simulation.sensor import expose, halo_px, integrate, sample_offsets
+from lsvision.simulation.sensor import expose, halo_px, integrate, sample_offsets, true_response
 from lsvision.simulation.surfaces import Look, Scene
 from lsvision.simulation.trajectory import Trajectory, cast_rays
-from lsvision.types import Board, Pose, RawRig, Rig, Transport, Travel
+from lsvision.types import Board, CameraResponse, Pose, RawRig, Rig, Transport, Travel
 
 # Lines rendered at once. Blocks begin at multiples of it, so that strips of every height have the same bits; 32 lines
 # of samples fit the processor's cache.
 _BLOCK = 32
 _LOG_STREAM = 7
+_RESPONSE_STREAM = -1  # no line has this number
 
 
 @dataclass(frozen=True)
@@ -145,8 +146,16 @@ class Simulation:
         columns = sample_offsets(-reach, self.width_px + 2 * reach, self.sensor)
         lines = sample_offsets(first - reach, _BLOCK + 2 * reach, self.sensor)
         light = integrate(self._look(camera, columns, lines).color, self.sensor)
-        seed = lattice_hash(torch.tensor(first), int(camera == "right"), self.sensor.seed)
-        return expose(light, self.sensor, int((float(seed) + 1.0) * 2**30))
+        seed = self._drawn(first, int(camera == "right"))
+        return expose(light, self.sensor, seed, None if self.sensor.is_even else self.response(camera))
+
+    def response(self, camera: Camera) -> CameraResponse:
+        """True offset and gain of the columns of a camera, float32."""
+        return true_response(self.sensor, self.width_px, self._drawn(_RESPONSE_STREAM, int(camera == "right")))
+
+    def _drawn(self, number: int, stream: int) -> int:
+        """A seed by the number of a line and a stream."""
+        return int((float(lattice_hash(torch.tensor(number), stream, self.sensor.seed)) + 1.0) * 2**30)
 
     def _look(self, camera: Camera, columns: Tensor, lines: Tensor) -> Look:
         """Colour and depth that samples see; each colour of a trilinear sensor looks at another plane."""

@@ -7,9 +7,11 @@ from torch import Tensor
 from torch.nn.functional import conv2d
 
 from lsvision.simulation.config import SensorConfig
+from lsvision.types import CameraResponse
 
 # The blur is cut at three sigma, where a Gaussian has fallen to a hundredth of its peak.
 _BLUR_REACH = 3.0
+_LEAST_GAIN = 0.05
 
 
 def halo_px(sensor: SensorConfig) -> int:
@@ -38,15 +40,33 @@ def integrate(samples: Tensor, sensor: SensorConfig) -> Tensor:
     return conv2d(rows, weights[None, None, None, :], stride=(1, step))[:, 0]
 
 
-def expose(light: Tensor, sensor: SensorConfig, seed: int) -> Tensor:
-    """Grey values ``(lines, columns, channels)``, uint8 or uint16, of light ``(3, lines, columns)``; white is 1."""
+def expose(light: Tensor, sensor: SensorConfig, seed: int, response: CameraResponse | None = None) -> Tensor:
+    """Grey values ``(lines, columns, channels)``, uint8 or uint16, of light ``(3, lines, columns)``; white is 1.
+
+    Args:
+        response: of the columns; None where they are even.
+    """
     grey = light.mean(0, keepdim=True) if sensor.mono else light
     generator = torch.Generator().manual_seed(seed)
     noise = torch.randn(grey.shape, generator=generator) if sensor.noise > 0 else torch.zeros(())
     full = 2**sensor.bits - 1
+    if response is not None:
+        grey = grey * response.gain.T[:, None]
     value = (sensor.exposure * grey + (sensor.noise / 255.0) * noise) * full
+    if response is not None:
+        value += response.offset.T[:, None]
     dtype = torch.uint8 if sensor.bits == 8 else torch.uint16
     return value.round_().clamp_(0, full).permute(1, 2, 0).to(dtype).contiguous()
+
+
+def true_response(sensor: SensorConfig, width: int, seed: int) -> CameraResponse:
+    """Offset and gain of every column and colour of a simulated camera, whose departures are drawn from a seed."""
+    generator = torch.Generator().manual_seed(seed)
+    gains, offsets = torch.randn(2, width, 1 if sensor.mono else 3, generator=generator).unbind(0)
+    end = torch.linspace(-1, 1, width)[:, None]
+    gain = (1.0 - sensor.vignetting * end.square()) * (1.0 + sensor.gain_noise * gains).clamp(min=_LEAST_GAIN)
+    full = 2**sensor.bits - 1
+    return CameraResponse((sensor.offset + sensor.offset_noise * offsets) * (full / 255.0), gain)
 
 
 def _pixel_weights(sensor: SensorConfig) -> Tensor:

@@ -29,6 +29,7 @@ from lsvision.types.product import (
     ProductStrip,
 )
 from lsvision.types.raw_rig import RIG_QUANTITIES, RawCamera, RawRig, ViewPlane
+from lsvision.types.response import CameraResponse
 from lsvision.types.rig_calibration import CameraResiduals, RigBoard, RigCalibration, RigCombination, RigVerdict
 from lsvision.types.scan import (
     Board,
@@ -57,6 +58,7 @@ __all__ = [
     "Calibration",
     "CalibrationMethod",
     "CameraResiduals",
+    "CameraResponse",
     "Depth",
     "DepthSource",
     "DepthView",

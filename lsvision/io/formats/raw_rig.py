@@ -12,7 +12,7 @@ import yaml
 from lsvision.errors import FileFormatError
 from lsvision.geometry import ideal_rig
 from lsvision.io.atomic import write_text
-from lsvision.io.formats.rig import RIG_FORMAT, PairEntries, rig_from_dict, spacing_to_dict
+from lsvision.io.formats.rig import RIG_FORMAT, PairEntries, RigEntries, spacing_to_dict
 from lsvision.io.formats.validation import read_entries, read_yaml
 from lsvision.schema import AcuteAngle, Checked, NonNegative, Positive, shown
 from lsvision.types import RIG_QUANTITIES, RawCamera, RawRig, Rig, ViewPlane
@@ -98,10 +98,14 @@ def _covariance_problem(rows: tuple[tuple[float, ...], ...]) -> str | None:
 
 @dataclass(frozen=True)
 class RigPair:
-    """The pair of a rig file; where that holds a raw one, ``rig`` is the ideal pair that follows from it."""
+    """The pair of a rig file; where that holds a raw one, ``rig`` is the ideal pair that follows from it.
+
+    ``response`` are the files of the cameras' responses by camera, as the rig file names them.
+    """
 
     rig: Rig
     raw: RawRig | None
+    response: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def image_width_px(self) -> int:
@@ -119,15 +123,17 @@ def read_rig_pair(path: Path | str) -> RigPair:
     data = read_yaml(path)
     format_ = data.get("format") if isinstance(data, Mapping) else None
     if format_ == RAW_RIG_FORMAT:
-        raw = raw_rig_from_dict(data, path)
+        of_raw = read_entries(RawRigEntries, data, path)
+        raw = of_raw.rig()
         try:
-            return RigPair(ideal_rig(raw), raw)
+            return RigPair(ideal_rig(raw), raw, of_raw.response.named if of_raw.response else {})
         except ValueError as error:
             raise FileFormatError(path, str(error)) from None
     if format_ is not None and format_ != RIG_FORMAT:
         problem = f"expected {RIG_FORMAT} or {RAW_RIG_FORMAT}, got {shown(format_)}"
         raise FileFormatError(path, problem, "format")
-    return RigPair(rig_from_dict(data, path), None)
+    entries = read_entries(RigEntries, data, path)
+    return RigPair(entries.rig(), None, entries.response.named if entries.response else {})
 
 
 def read_raw_rig(path: Path | str) -> RawRig:

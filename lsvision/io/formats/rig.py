@@ -6,13 +6,15 @@ from typing import Literal
 
 import yaml
 
+from lsvision.geometry import Camera
 from lsvision.io.atomic import write_text
 from lsvision.io.formats.validation import read_entries, read_yaml
-from lsvision.schema import Checked, Positive, PositiveInt
+from lsvision.schema import Checked, Positive, PositiveInt, Text
 from lsvision.types import Rig
 
 RigFormat = Literal["lsvision-rig/1"]
 RIG_FORMAT: RigFormat = "lsvision-rig/1"
+CAMERAS: tuple[Camera, ...] = ("left", "right")
 
 
 @dataclass(frozen=True)
@@ -37,6 +39,19 @@ class ColorSpacing(Checked):
     blue: float
 
 
+@dataclass(frozen=True)
+class ResponseFiles(Checked):
+    """Entry ``response``: the file of each camera's response, relative to ``rig.yaml``; None for an even camera."""
+
+    left: Text | None = None
+    right: Text | None = None
+
+    @property
+    def named(self) -> dict[str, str]:
+        """The files by camera."""
+        return {camera: name for camera, name in asdict(self).items() if name is not None}
+
+
 @dataclass(frozen=True, kw_only=True)
 class PairEntries(Checked):
     """The entries of any pair of line cameras."""
@@ -45,6 +60,7 @@ class PairEntries(Checked):
     pixel_pitch_um: Positive
     baseline_mm: Positive
     color_spacing_lines: ColorSpacing | None = None
+    response: ResponseFiles | None = None
 
     @property
     def spacing(self) -> tuple[float, float, float]:
