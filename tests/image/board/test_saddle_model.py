@@ -27,6 +27,15 @@ def plain_formula(columns: Tensor, grid: Tensor) -> Tensor:
     return levels[0] + levels[1] * edges[0] + levels[2] * edges[1] + levels[3] * edges[0] * edges[1]
 
 
+def plain_derivative(columns: Tensor, grid: Tensor) -> Tensor:
+    """Derivative (pixels, 17) of the plain formula, of each pixel on its own: it takes as long as the formula."""
+
+    def at_pixel(columns: Tensor, uv: Tensor) -> Tensor:
+        return plain_formula(columns, uv[:, None])[0]
+
+    return torch.func.vmap(torch.func.grad(at_pixel), (None, 1))(columns, grid)
+
+
 @pytest.fixture
 def parameters(corners) -> SaddleParameters:
     position, angles, blur = corners
@@ -84,7 +93,7 @@ def test_values_are_the_plain_formula(parameters, grid):
 def test_jacobian_is_the_derivative_of_the_plain_formula(parameters, grid, model):
     jacobian = Saddle.on_grid(parameters, grid).jacobian(model)
     for ours, columns in zip(jacobian, parameters.columns, strict=True):
-        by_autograd = torch.func.jacrev(plain_formula)(columns, grid)
+        by_autograd = plain_derivative(columns, grid)
         torch.testing.assert_close(ours.mT, by_autograd[:, model.free], rtol=0, atol=1e-9)
 
 
