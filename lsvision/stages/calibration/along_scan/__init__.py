@@ -13,6 +13,7 @@ from lsvision.stages.calibration.along_scan.kernels import FINE, SEARCHED
 from lsvision.stages.calibration.along_scan.lines import COMPONENTS, latents
 from lsvision.stages.calibration.along_scan.posterior import Processes, processes_given_corners
 from lsvision.stages.calibration.along_scan.search import Beforehand, FoundErrors, search
+from lsvision.stages.calibration.along_scan.spectrum import Spectrum
 
 __all__ = [
     "COMPONENTS",
@@ -25,6 +26,7 @@ __all__ = [
     "FoundErrors",
     "Linearised",
     "Processes",
+    "Spectrum",
     "by_chance",
     "edge_rows",
     "errors_along_scan",
