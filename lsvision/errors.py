@@ -62,6 +62,10 @@ class UnusableCalibrationError(CalibrationError):
         return type(self), (self.path, self.verdict, self.reasons)
 
 
+class ResponseError(LsvisionError):
+    """References or an archive from which the response of the cameras cannot be measured; says which and why."""
+
+
 class NothingMeasuredError(LsvisionError):
     """A product of which next to nothing was measured: its scan, calibration or options do not fit each other."""
 

@@ -1,5 +1,6 @@
 """Archives of scans: found, planned, processed in strips on many workers, and recorded in a ledger."""
 
+from lsvision.archive.alarms import SIGNALS, Alarm, Signal, alarms, groups_of, health_in_words, measured_of
 from lsvision.archive.driver import damaged_products, process_scans
 from lsvision.archive.engines.in_process import InProcessEngine
 from lsvision.archive.engines.local import LocalEngine
@@ -19,7 +20,9 @@ from lsvision.archive.tasks import Outcome, Task, product_rows
 
 __all__ = [
     "LEDGER_FILE",
+    "SIGNALS",
     "WORK_FOLDER",
+    "Alarm",
     "DatedCalibration",
     "Engine",
     "EngineConfig",
@@ -35,15 +38,20 @@ __all__ = [
     "PlannedScan",
     "Processing",
     "ScanRow",
+    "Signal",
     "StripRow",
     "Task",
+    "alarms",
     "calibration_for",
     "damaged_products",
     "find_scans",
+    "groups_of",
+    "health_in_words",
     "is_worked_on",
     "ledger_lines",
     "local_archive",
     "measured_line_motion",
+    "measured_of",
     "plan_one",
     "plan_run",
     "predicted_bytes",

@@ -2,10 +2,11 @@
 
 import shutil
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 from lsvision.archive.depth_store import create_depth_store, remove_partial_chunks
+from lsvision.archive.health import MeasureHealth, ScanHealth
 from lsvision.archive.identity import key_of
 from lsvision.archive.ledger import Ledger, ScanRow, Stage, StripRow, measured_cells
 from lsvision.archive.line_motion import FindLineMotion, FoundLineMotion, StoredLineMotion
@@ -35,7 +36,7 @@ class Place:
     """Where a run works: its ledger, its output, and the folder below which depth and unfinished products lie.
 
     ``keep_depth`` has the matched depth stored, which many workers and later corrections read; without it, depth is
-    matched where it is read. ``verify`` asks for every product to be read back before it gets its name.
+    matched where it is read. ``verify`` has every product read back before it gets its name, ``watch`` drift measured.
     """
 
     ledger: Ledger
@@ -44,6 +45,7 @@ class Place:
     processing: Processing
     keep_depth: bool = True
     verify: bool = False
+    watch: bool = False
 
 
 class ScanJob:
@@ -71,6 +73,7 @@ class ScanJob:
             self._hashing()
             or self._matching()
             or self._finding_line_motion()
+            or self._watching()
             or self._correcting()
             or self._finishing()
         )
@@ -81,8 +84,8 @@ class ScanJob:
     def record(self, task: Task, outcome: Outcome) -> None:
         """Record what came of a task."""
         result = outcome.result
-        if isinstance(result, InputHash):
-            self._place.ledger.put_scan(replace(self._row, input_sha256=result.sha256))
+        if isinstance(result, InputHash | ScanHealth):
+            self._place.ledger.put_scan(replace(self._row, **asdict(result)))
         if task.strip is not None:
             row = StripRow(
                 task.scan, task.strip.stage, task.strip.number, task.strip.key,
@@ -143,19 +146,23 @@ class ScanJob:
 
     def _finding_line_motion(self) -> list[Task]:
         results, planned = self._results, self.planned
-        store = results.line_motion_store
-        if store is None:
+        if (store := results.line_motion_store) is None:
             return []
         if self._line_motion() is None:
             check_own(Path(results.product.final), planned, results.input_sha256)
             self._place.ledger.forget_strips(planned.key, "line_motion")
             with naming_full_disk(store):
                 self._work.mkdir(parents=True, exist_ok=True)
-        depth = str(results.depth_store) if results.depth_store else None
-        n = tuple(planned.calibration.calibration.motion.n.tolist())
-        processing = self._place.processing
-        work = FindLineMotion(planned.files, depth, processing.disparity, n, processing.line_motion, str(store))
+        config, choice = self._place.processing.disparity, self._place.processing.line_motion
+        work = FindLineMotion(planned.files, results.depth_folder, config, planned.n, choice, str(store))
         return self._missing("line_motion", results.line_motion_key, [work])
+
+    def _watching(self) -> list[Task]:
+        if not self._place.watch:
+            return []
+        results, disparity = self._results, self._place.processing.disparity
+        work = MeasureHealth(self.planned.files, results.depth_folder, disparity, self.planned.n)
+        return self._missing("health", results.health_key, [work])
 
     def _correcting(self) -> list[Task]:
         if self._is_renamed():
@@ -173,13 +180,10 @@ class ScanJob:
                 )
                 create_product(partial, layout)
                 partial.rename(working)
-        motion = planned.calibration.calibration.motion
-        n, covariance = tuple(motion.n.tolist()), tuple(map(tuple, motion.covariance.tolist()))
-        store = str(results.depth_store) if results.depth_store else None
         line_motion = None if found is None else (str(results.line_motion_store), found.sha256)
         source = CorrectionInput(
-            planned.files, store, self._place.processing.disparity, n, covariance, planned.correction, planned.grid,
-            line_motion,
+            planned.files, results.depth_folder, self._place.processing.disparity, planned.n, planned.covariance,
+            planned.correction, planned.grid, line_motion,
         )  # fmt: skip
         work = [CorrectStrip(source, number, results.product) for number in range(planned.product_strips)]
         return self._missing("product", results.product_key, work)

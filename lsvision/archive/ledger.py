@@ -20,7 +20,7 @@ _OF_THE_DISK = {
     sqlite3.SQLITE_LOCKED, sqlite3.SQLITE_NOMEM,
 }  # fmt: skip
 
-Stage = Literal["disparity", "line_motion", "product"]
+Stage = Literal["disparity", "line_motion", "health", "product"]
 Status = Literal["running", "stopped", "done", "failed"]  # a scan as running while no run is at work was stopped
 
 log = logging.getLogger(__name__)
@@ -37,6 +37,8 @@ class ScanRow:
     the motion that was corrected, ``drift_sigma_mm_per_m`` the largest standard deviation of a position, mm per metre.
     ``line_motion`` says where the motion from line to line came from and what was found of every component; ``rms_``
     are those of the components that were corrected, zero for the others.
+    ``taken`` is the scan's attribute ``date``; what follows are its signals of drift, as ``ScanHealth``, None where
+    not measured.
     """
 
     scan: str
@@ -62,6 +64,16 @@ class ScanRow:
     rms_dz_mm: float = 0.0
     rms_roll_rad: float = 0.0
     rms_dy_mm: float = 0.0
+    taken: str = ""
+    askew_sideways_deg: float | None = None
+    askew_sideways_sigma_deg: float | None = None
+    askew_in_depth_deg: float | None = None
+    askew_in_depth_sigma_deg: float | None = None
+    travel_rate: float | None = None
+    travel_sigma: float | None = None
+    row_offset_lines: float | None = None
+    row_offset_sigma_lines: float | None = None
+    gain_ratio: float | None = None
 
 
 @dataclass(frozen=True)

@@ -39,7 +39,7 @@ def forget() -> None:
     """Drop what is open, of every thread."""
     global latest
     open_scan.cache_clear()
-    _relation.cache_clear()
+    open_relation.cache_clear()
     latest = threading.local()
 
 
@@ -60,10 +60,11 @@ def open_scan(files: ScanFiles) -> Scan:
 def open_depth(files: ScanFiles, config: DisparityConfig) -> DepthSource:
     """The depth of a scan: its own, or matched where it is read."""
     n = None if files.n is None else torch.tensor(files.n, dtype=torch.float64)
-    return depth_of(open_scan(files), config, _relation(files, config), n)
+    return depth_of(open_scan(files), config, open_relation(files, config), n)
 
 
 # Measuring it anew for each strip would cost a tenth of matching.
 @lru_cache(maxsize=2)
-def _relation(files: ScanFiles, config: DisparityConfig) -> PairRelation | None:
+def open_relation(files: ScanFiles, config: DisparityConfig) -> PairRelation | None:
+    """How the two images of a scan differ apart from disparity; None for a scan with a depth map."""
     return relation_of_scan(open_scan(files), config)

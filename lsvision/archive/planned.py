@@ -56,7 +56,7 @@ class PlannedScan:
 
     ``matched`` says whether its depth has to be matched, ``cell_bytes`` is the size of a cell of its product, and
     ``correction`` has the strips that fit the memory of a worker. ``missing_lines`` counts those that are not there.
-    ``logged`` says whether the scan has a log of its motion from line to line.
+    ``logged`` says whether the scan has a log of its motion from line to line, ``taken`` is its attribute ``date``.
     """
 
     key: str
@@ -70,6 +70,17 @@ class PlannedScan:
     correction: CorrectionConfig
     missing_lines: int = 0
     logged: bool = False
+    taken: str = ""
+
+    @property
+    def n(self) -> tuple[float, ...]:
+        """The motion of its calibration."""
+        return tuple(self.calibration.calibration.motion.n.tolist())
+
+    @property
+    def covariance(self) -> tuple[tuple[float, ...], ...]:
+        """That of ``n``."""
+        return tuple(map(tuple, self.calibration.calibration.motion.covariance.tolist()))
 
     @property
     def product_strips(self) -> int:
@@ -115,6 +126,7 @@ def plan_scan(found: Found, calibrations: Sequence[DatedCalibration], processing
         correction=replace(processing.correction, strip_rows=_strip_rows(scan, frame, grid, processing)),
         missing_lines=scan.missing_lines,
         logged=scan.line_motion is not None,
+        taken=scan.attributes.get("date", ""),
     )
 
 

@@ -50,6 +50,11 @@ class ScanResults:
         return key_of(depth, sha256, choice.key, processing.repair_encoder, processing.missing_lines, planned.lines)
 
     @cached_property
+    def health_key(self) -> str:
+        """That of its signals of drift."""
+        return key_of("health", self.depth_key, self.planned.calibration.sha256)
+
+    @cached_property
     def product_key(self) -> str:
         """That of the product."""
         processing = self.processing
@@ -67,6 +72,11 @@ class ScanResults:
         """Where the matched depth is stored; None where none is."""
         stored = self.planned.matched and (self.keep_depth or self.line_motion_origin == "measured")
         return self.work / f"depth-{self.depth_key[:16]}" if stored else None
+
+    @property
+    def depth_folder(self) -> str | None:
+        """The same as plain data, for workers."""
+        return None if self.depth_store is None else str(self.depth_store)
 
     @property
     def line_motion_store(self) -> Path | None:

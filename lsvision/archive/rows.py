@@ -1,9 +1,11 @@
 """The ledger's row of a scan, from its start to its end."""
 
 from collections.abc import Iterable
-from dataclasses import replace
+from dataclasses import fields, replace
+from typing import Any
 
 from lsvision import __version__
+from lsvision.archive.health import ScanHealth
 from lsvision.archive.ledger import ScanRow, StripRow
 from lsvision.archive.line_motion import StoredLineMotion
 from lsvision.archive.planned import PlannedScan, Processing
@@ -35,7 +37,14 @@ def running_row(planned: PlannedScan, processing: Processing, known: ScanRow | N
         sideways_mm_per_m=sideways,
         in_depth_mm_per_m=in_depth,
         drift_sigma_mm_per_m=max(drift_per_metre(calibration.motion)),
+        taken=planned.taken,
+        **(_health_of(known) if known is not None and untouched else {}),
     )
+
+
+def _health_of(row: ScanRow) -> dict[str, Any]:
+    """The signals of drift of a row."""
+    return {item.name: getattr(row, item.name) for item in fields(ScanHealth)}
 
 
 def finished_row(

@@ -2,7 +2,7 @@
 
 import sqlite3
 
-VERSION = 5  # of the tables; version 1 recorded none, versions 2 to 4 lacked the last columns of the scans
+VERSION = 6  # of the tables; version 1 recorded none, versions 2 to 5 lacked the last columns of the scans
 
 _TABLES = (
     """
@@ -36,7 +36,19 @@ _SINCE_VERSION_5 = (
     "rms_roll_rad REAL NOT NULL DEFAULT 0.0",
     "rms_dy_mm REAL NOT NULL DEFAULT 0.0",
 )
-_ADDED = {3: _SINCE_VERSION_3, 4: _SINCE_VERSION_4, 5: _SINCE_VERSION_5}
+_SINCE_VERSION_6 = (
+    "taken TEXT NOT NULL DEFAULT ''",
+    "askew_sideways_deg REAL",
+    "askew_sideways_sigma_deg REAL",
+    "askew_in_depth_deg REAL",
+    "askew_in_depth_sigma_deg REAL",
+    "travel_rate REAL",
+    "travel_sigma REAL",
+    "row_offset_lines REAL",
+    "row_offset_sigma_lines REAL",
+    "gain_ratio REAL",
+)
+_ADDED = {3: _SINCE_VERSION_3, 4: _SINCE_VERSION_4, 5: _SINCE_VERSION_5, 6: _SINCE_VERSION_6}
 
 
 def version_of(db: sqlite3.Connection) -> int:

@@ -54,7 +54,7 @@ class ProductPlace:
 class InputHash:
     """SHA-256 of a scan's files."""
 
-    sha256: str
+    input_sha256: str
 
 
 @dataclass(frozen=True)

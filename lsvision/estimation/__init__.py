@@ -2,7 +2,8 @@
 
 The calibration uses ``iterated_update``, ``filter_sequence``, ``levenberg_marquardt``, ``slr`` and the information of a
 posterior; the motion from line to line uses ``fit_signals`` and ``smooth_signals``, and with them ``matern``; to
-separate it from the object's shape, ``fit_shares`` and ``smooth_shares``, and with them ``oscillation`` and ``smooth``.
+separate it from the object's shape, ``fit_shares`` and ``smooth_shares``, and with them ``oscillation`` and ``smooth``;
+an archive's health, ``changes``.
 The rest is library API for other models, which the package itself does not call: ``measurement`` and ``whitened_rows``
 for the joint update, ``predict`` and ``update`` for filters, ``filter_signals`` in square-root form, ``recentre`` for
 rotations in a state, ``nis``, ``fisher_information`` and ``marginal_information`` for checks. ``linalg`` holds the
@@ -11,6 +12,7 @@ matrix functions that all of them use, and the rule on bits.
 
 from lsvision.estimation.bordered import BorderedFit, BorderedState, bordered_least_squares, shared_information
 from lsvision.estimation.consistency import chi_square_tail, mean_chi_square_band, nees, nis
+from lsvision.estimation.control_chart import Change, ChangeRule, ControlChart, changes, control_chart
 from lsvision.estimation.cubature import AffineModel, slr
 from lsvision.estimation.derivative import jacobian
 from lsvision.estimation.filtering import StateSpace, Track, Update, filter_sequence, predict, update
@@ -39,6 +41,9 @@ __all__ = [
     "AffineModel",
     "BorderedFit",
     "BorderedState",
+    "Change",
+    "ChangeRule",
+    "ControlChart",
     "Directions",
     "Gaussian",
     "Info",
@@ -61,7 +66,9 @@ __all__ = [
     "Update",
     "apply",
     "bordered_least_squares",
+    "changes",
     "chi_square_tail",
+    "control_chart",
     "cramer_rao_bound",
     "filter_sequence",
     "filter_signals",

@@ -40,6 +40,7 @@ EXPERIMENTS = {
     "simulate": Experiment("simulate", "run_simulate", "SimulateSettings"),
     "calibrate": Experiment("calibrate", "run_calibrate", "CalibrateSettings"),
     "rig": Experiment("rig", "run_rig", "RigSettings"),
+    "response": Experiment("response", "run_response", "ResponseSettings"),
     "correct": Experiment("correct", "run_correct", "CorrectSettings"),
     "motion": Experiment("motion", "run_motion", "MotionSettings"),
     "reprocess": Experiment("reprocess", "run_reprocess", "ReprocessSettings"),

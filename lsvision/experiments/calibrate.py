@@ -13,6 +13,7 @@ from lsvision.experiments.settings import RunSettings, settings_sha256
 from lsvision.geometry import Rectification
 from lsvision.image.tiling import one_torch_thread
 from lsvision.io import read_scan, scan_sha256, write_calibration, write_json, write_line_motion
+from lsvision.io.formats.installation import installation_to_dict
 from lsvision.report import calibration_report, calibration_summary
 from lsvision.report.progress import progress_bars
 from lsvision.schema import Text
@@ -22,7 +23,19 @@ from lsvision.stages.corners.config import CornersConfig
 from lsvision.stages.corners.edges import find_edges
 from lsvision.stages.corners.find import LocatedCorners, locate_in_images, measure_corners
 from lsvision.stages.corners.rows import row_difference
-from lsvision.types import Board, BoardCorners, BoardEdges, Calibration, MissingLines, Provenance, Scan
+from lsvision.stages.installation.config import InstallationConfig
+from lsvision.stages.installation.guide import Transported, installation_guide
+from lsvision.types import (
+    Board,
+    BoardCorners,
+    BoardEdges,
+    Calibration,
+    Installation,
+    MissingLines,
+    Provenance,
+    RigCalibration,
+    Scan,
+)
 
 log = logging.getLogger(__name__)
 
@@ -39,6 +52,7 @@ class CalibrateSettings(RunSettings):
     board: Board
     corners: CornersConfig
     calibration: CalibrationConfig
+    installation: InstallationConfig = field(default_factory=InstallationConfig)
     missing_lines: MissingLines = "refuse"
     output: Text | None = None
 
@@ -64,13 +78,26 @@ def run_calibrate(settings: CalibrateSettings, folder: Path) -> None:
         scans=tuple((str(scan.path), scan_sha256(scan.path)) for scan in scans),
     )
     target = Path(settings.output) if settings.output else folder / "calibration.json"
-    calibration = write_line_motions(replace(calibration, provenance=provenance), target)
+    guide = alignment(calibration, scans, settings.calibration.prior_sigma, settings.installation)
+    calibration = replace(calibration, provenance=provenance, installation=guide, raw_rig=scans[0].raw_rig)
+    calibration = write_line_motions(calibration, target)
     write_calibration(calibration, target)
     write_json(folder / "summary.json", _summary(calibration))
     calibration_report(calibration, boards, asdict(settings), folder)
     log.info("%s\nwrote %s and %s", calibration_summary(calibration), target, folder / "report.html")
     if not calibration.usable:
         raise UnusableCalibrationError(str(target), calibration.verdict, calibration.reasons)
+
+
+def alignment(
+    calibration: Calibration | RigCalibration, scans: Sequence[Scan], prior_sigma: float, config: InstallationConfig
+) -> Installation | None:
+    """How to align the cameras with the motion of the scans; None where it is not known."""
+    if not calibration.usable:
+        return None
+    pitches = {scan.travel.line_pitch_mm for scan in scans}
+    moved = Transported(pitches.pop() if len(pitches) == 1 else None, scans[0].travel.transport)
+    return installation_guide(calibration.motion, prior_sigma, moved, config)
 
 
 def calibrate_with_edges(
@@ -189,5 +216,6 @@ def _summary(calibration: Calibration) -> dict:
         "rmse_after_mm": calibration.rmse_after_mm,
         "improvement": calibration.improvement,
         "iterations": len(calibration.iterations) - 1,
+        "installation": installation_to_dict(calibration.installation),
         "converged": calibration.converged,
     }

@@ -1,30 +1,26 @@
 """``+experiment=motion``: one scan and its calibration -> the motion from line to line alone, with figures."""
 
 import logging
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 import torch
 
 from lsvision.archive import calibration_for, measured_line_motion, read_calibrations
-from lsvision.archive.depth_store import create_depth_store, open_depth_store, write_depth
-from lsvision.archive.line_motion import line_motion_metadata, measured_travel
+from lsvision.archive.line_motion import line_motion_metadata, section_of
 from lsvision.experiments.settings import RunSettings
+from lsvision.experiments.stored_depth import stored_depth
 from lsvision.geometry import ProductFrame, object_pitch_mm
 from lsvision.image.tiling import keep_freed_memory
 from lsvision.io import read_scan, write_json, write_line_motion
 from lsvision.report.line_motion_figures import LineMotionView, Profiles
 from lsvision.report.line_motion_pages import MeasuredMotion, motion_report
 from lsvision.report.line_motion_words import line_motion_words
-from lsvision.report.progress import progress_bars
 from lsvision.schema import Text
 from lsvision.stages.disparity.config import DisparityConfig
 from lsvision.stages.disparity.depth import depth_of
 from lsvision.stages.line_motion.config import LineMotionConfig
-from lsvision.types import Depth, DepthSource, DepthView, MissingLines, RefusedVerdict, Scan
+from lsvision.types import MissingLines, RefusedVerdict
 
 log = logging.getLogger(__name__)
 
@@ -46,15 +42,16 @@ class MotionSettings(RunSettings):
 
 def run_motion(settings: MotionSettings, folder: Path) -> None:
     """Measure the motion; write ``line_motion.parquet``, ``summary.json`` and the report."""
+    section = section_of(settings.registration)
     scan = read_scan(settings.scan, repair_encoder=settings.repair_encoder, missing_lines=settings.missing_lines)
     dated = calibration_for(scan, read_calibrations(settings.calibration, settings.accept))
     if dated.warning:
         log.warning("%s", dated.warning)
     keep_freed_memory()
     matched = depth_of(scan, settings.disparity, n=dated.calibration.motion.n)
-    with _stored_depth(scan, matched, settings.disparity, folder) as depth:
-        motion = measured_line_motion(scan, depth, dated.calibration.motion, settings.registration)
-        travel = measured_travel(scan, depth, dated.calibration.motion, settings.registration)
+    with stored_depth(scan, matched, settings.disparity, folder) as depth:
+        measured = measured_line_motion(scan, depth, dated.calibration.motion, settings.registration, section)
+        motion, travel = measured.motion, measured.travel
         still = ProductFrame(scan.rig, scan.travel, dated.calibration.motion.n)
         steadied = ProductFrame(scan.rig, scan.travel, still.n, None if motion.is_still else motion)
         lines = _spread_lines(scan.lines)
@@ -71,23 +68,6 @@ def run_motion(settings: MotionSettings, folder: Path) -> None:
     log.info("wrote %s", folder / "line_motion.parquet")
     view = LineMotionView.of(motion, metadata)
     motion_report(MeasuredMotion(str(scan.path), metadata, view, before, after), asdict(settings), folder)
-
-
-@contextmanager
-def _stored_depth(scan: Scan, depth: DepthSource, config: DisparityConfig, folder: Path) -> Iterator[DepthSource]:
-    """The depth of a scan, which is read several times: matched once, into a store that is removed at the end."""
-    if isinstance(scan.images, DepthView):
-        yield depth
-        return
-    with TemporaryDirectory(prefix=".depth-", dir=folder) as temporary, progress_bars() as bars:
-        store, step = Path(temporary) / "depth", config.work_lines
-        create_depth_store(store, scan.lines, scan.rig.width_px, step, with_sigma=False)
-        bar = bars.start(f"match {scan.path.name}", total=scan.lines)
-        for start in range(0, scan.lines, step):
-            part: Depth = depth.read(start, min(start + step, scan.lines))
-            write_depth(str(store), start, part, with_sigma=False)
-            bars.advance(bar, len(part.z))
-        yield open_depth_store(str(store))
 
 
 def _spread_lines(lines: int) -> list[range]:

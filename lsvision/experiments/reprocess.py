@@ -21,8 +21,10 @@ from lsvision.archive import (
     Processing,
     ScanRow,
     Task,
+    alarms,
     damaged_products,
     find_scans,
+    health_in_words,
     is_worked_on,
     ledger_lines,
     local_archive,
@@ -37,11 +39,12 @@ from lsvision.archive import (
 )
 from lsvision.errors import ConfigError, ScansFailedError
 from lsvision.experiments.settings import RunSettings
-from lsvision.report.archive_pages import reprocess_report
+from lsvision.report.archive_pages import Run, reprocess_report
 from lsvision.report.progress import progress_bars
 from lsvision.schema import PositiveInt, Text
 from lsvision.stages.correction.config import CorrectionConfig
 from lsvision.stages.disparity.config import DisparityConfig
+from lsvision.stages.health.config import HealthConfig
 from lsvision.stages.line_motion.config import LineMotionConfig
 from lsvision.types import MissingLines, RefusedVerdict
 
@@ -54,7 +57,8 @@ class ReprocessSettings(RunSettings):
 
     ``line_motion`` is ``none``, a file for all scans, or ``auto``: a scan's own log, else what its profile shows by
     ``registration``.
-    A calibration without a usable n is refused, unless ``accept`` has its verdict.
+    A calibration without a usable n is refused, unless ``accept`` has its verdict. ``health`` is when a drift of the
+    scans is an alarm.
     """
 
     archive: Text
@@ -69,6 +73,7 @@ class ReprocessSettings(RunSettings):
     missing_lines: MissingLines = "refuse"
     line_motion: Text = "auto"
     registration: LineMotionConfig = field(default_factory=LineMotionConfig)
+    health: HealthConfig = field(default_factory=HealthConfig)
     accept: list[RefusedVerdict] = field(default_factory=list)
 
 
@@ -77,6 +82,7 @@ class StatusSettings(RunSettings):
     """Options of ``+experiment=status``."""
 
     output: Text
+    health: HealthConfig = field(default_factory=HealthConfig)
     threads: PositiveInt = 1
 
 
@@ -95,7 +101,8 @@ def run_reprocess(settings: ReprocessSettings, folder: Path) -> None:
         plan = _plan(settings, output, ledger.scans())
         _log_plan(plan, ledger.seconds_per_line(), settings.engine)
         begin = time.perf_counter()
-        place = Place(ledger, output, output / WORK_FOLDER, _processing(settings), verify=settings.verify)
+        processing = _processing(settings)
+        place = Place(ledger, output, output / WORK_FOLDER, processing, verify=settings.verify, watch=True)
         try:
             processed = _process(settings, plan, place)
         except KeyboardInterrupt:
@@ -106,9 +113,12 @@ def run_reprocess(settings: ReprocessSettings, folder: Path) -> None:
         keys = {scan.key for scan in (*plan.to_do, *plan.unchanged)} | {found.key for found in plan.faulty}
         rows = {key: row for key, row in ledger.scans().items() if key in keys}
     failed = {key: row for key, row in rows.items() if row.status == "failed"}
-    reprocess_report(rows, processed, output, seconds, asdict(settings), folder)
+    drifts = alarms(rows, settings.health)
+    reprocess_report(rows, processed, Run(output, seconds, asdict(settings), settings.health, drifts), folder)
     for line in ledger_lines(failed):
         log.info("%s", line)
+    for drift in drifts:
+        log.warning("drift: %s", drift.in_words)
     done = sum(row.status == "done" for row in processed)
     log.info("%d done, %d unchanged, %d failed, in %.1f s", done, len(rows) - done - len(failed), len(failed), seconds)
     if failed:
@@ -125,6 +135,10 @@ def run_status(settings: StatusSettings, folder: Path) -> None:
         rows = {key: _at_rest(row) for key, row in rows.items()}
     for line in ledger_lines(rows):
         log.info("%s", line)
+    drifts = alarms(rows, settings.health)
+    for drift in drifts:
+        log.warning("drift: %s", drift.in_words)
+    log.info("%s", health_in_words(rows, drifts, settings.health))
 
 
 def _at_rest(row: ScanRow) -> ScanRow:

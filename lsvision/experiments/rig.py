@@ -6,11 +6,12 @@ from pathlib import Path
 
 from lsvision import __version__
 from lsvision.errors import ConfigError, UnusableCalibrationError
-from lsvision.experiments.calibrate import locate_boards, read_scans
+from lsvision.experiments.calibrate import alignment, locate_boards, read_scans
 from lsvision.experiments.settings import RunSettings, settings_sha256
 from lsvision.io import read_raw_rig, scan_sha256, write_raw_rig, write_rig_calibration
 from lsvision.report.rig_pages import rig_report, rig_summary
 from lsvision.schema import Text
+from lsvision.stages.installation.config import InstallationConfig
 from lsvision.stages.rig.calibrate import calibrate_rig
 from lsvision.stages.rig.config import RigConfig
 from lsvision.stages.rig.sightings import Sightings, joined, sighted
@@ -31,6 +32,7 @@ class RigSettings(RunSettings):
     data_sheet: Text | None = None
     board: Board
     estimate: RigConfig
+    installation: InstallationConfig = field(default_factory=InstallationConfig)
     missing_lines: MissingLines = "refuse"
 
 
@@ -50,7 +52,8 @@ def run_rig(settings: RigSettings, folder: Path) -> None:
         config_sha256=settings_sha256(settings),
         scans=tuple((str(scan.path), scan_sha256(scan.path)) for scan in scans),
     )
-    calibration = replace(calibration, provenance=provenance)
+    guide = alignment(calibration, scans, settings.estimate.motion_sigma, settings.installation)
+    calibration = replace(calibration, provenance=provenance, installation=guide)
     write_rig_calibration(calibration, folder / "rig_calibration.json")
     write_raw_rig(calibration.rig, folder / "rig.yaml")
     rig_report(calibration, start, asdict(settings), folder)

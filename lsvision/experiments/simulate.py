@@ -12,6 +12,7 @@ from lsvision.errors import ConfigError
 from lsvision.experiments.settings import RunSettings
 from lsvision.geometry import scaled_raw_rig, scaled_rig
 from lsvision.io import NewScan, read_rig_pair, write_scan
+from lsvision.io.formats.rig import CAMERAS
 from lsvision.report.progress import ProgressBars, progress_bars
 from lsvision.schema import Positive, PositiveInt, Scale, Text
 from lsvision.simulation import (
@@ -23,7 +24,7 @@ from lsvision.simulation import (
     Simulation,
     simulate,
 )
-from lsvision.types import Board, RawRig, Rig, Transport
+from lsvision.types import Board, CameraResponse, RawRig, Rig, Transport
 
 log = logging.getLogger(__name__)
 
@@ -94,7 +95,10 @@ def _scaled_rig(settings: SimulateSettings) -> Rig | RawRig:
 def write_simulation(
     simulation: Simulation, target: Path, bars: ProgressBars, *, depth: bool = False, strip_lines: int = 256
 ) -> None:
-    """Write a simulated scan with its ``truth.json``; with ``depth`` the true depth map in place of the right image."""
+    """Write a simulated scan with its ``truth.json``; with ``depth`` the true depth map in place of the right image.
+
+    Where columns respond unevenly, ``true_left_response.tif`` and ``true_right_response.tif`` are written too.
+    """
     bar = bars.start(f"render {target.name}", total=2 * simulation.lines)
 
     def counted(strips: Iterator[Tensor]) -> Iterator[Tensor]:
@@ -116,5 +120,13 @@ def write_simulation(
             color_registered=simulation.sensor.color_registered,
             raw_rig=simulation.raw_rig,
             extra_json={"truth.json": simulation.truth()},
+            responses=_true_responses(simulation),
         ),
     )
+
+
+def _true_responses(simulation: Simulation) -> dict[str, CameraResponse]:
+    """The responses of both cameras by file name; none of even ones."""
+    if simulation.sensor.is_even:
+        return {}
+    return {f"true_{camera}_response.tif": simulation.response(camera) for camera in CAMERAS}

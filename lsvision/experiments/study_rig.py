@@ -10,7 +10,7 @@ from lsvision.io.formats.raw_rig import RawRigEntries
 from lsvision.io.parquet import write_parquet
 from lsvision.report.rig_study_pages import rig_study_report
 from lsvision.schema import PositiveInt, Text
-from lsvision.stages.rig.config import RigConfig
+from lsvision.stages.rig.config import RigConfig, RigSigmas
 from lsvision.stages.rig.model import RigPrior
 from lsvision.study.grid import study_points
 from lsvision.study.rig_runs import RigSampling, run_rigs
@@ -25,11 +25,26 @@ def axes_not_studied() -> dict[str, list[float | int] | None]:
     return {item.name: None for item in fields(RigConditions)}
 
 
+def usual_deviations() -> RigSigmas:
+    """How far cameras are from their data sheet, as a rule."""
+    return RigSigmas(
+        focal_length_share=0.005,
+        principal_sigma_px=1.0,
+        turn_sigma_deg=0.3,
+        distortion_sigma=0.02,
+        baseline_share=0.001,
+        plane_sigma_mm=0.3,
+        plane_slope_sigma=0.0035,
+        motion_sigma=0.02,
+    )
+
+
 @dataclass(frozen=True, kw_only=True)
 class StudyRigSettings(RunSettings):
     """Options of the experiment.
 
-    ``data_sheet`` is the prior; ``conditions`` are what every point has but for the ``axes``: lists of values by name
+    ``data_sheet`` is the prior, with the sigmas of ``estimate``; the true rigs differ from it by those of ``drawn``.
+    ``conditions`` are what every point has but for the ``axes``: lists of values by name
     of a condition, whose grid is studied. ``runs`` rigs are drawn and calibrated per point.
     """
 
@@ -38,16 +53,18 @@ class StudyRigSettings(RunSettings):
     board: Board
     estimate: RigConfig
     conditions: RigConditions
+    drawn: RigSigmas = field(default_factory=usual_deviations)
     axes: dict[str, list[float | int] | None] = field(default_factory=axes_not_studied)
     runs: PositiveInt = 100
 
 
 def run_study_rig(settings: StudyRigSettings, folder: Path) -> None:
     """Calibrate drawn rigs at every point; write the table, the summary and the report."""
-    prior = RigPrior.of(settings.data_sheet.rig(), settings.estimate)
+    rig = settings.data_sheet.rig()
+    prior, drawn = (RigPrior.of(rig, sigmas) for sigmas in (settings.estimate, settings.drawn))
     points = study_points(settings.conditions, settings.axes)
     sampling = RigSampling(settings.runs, settings.seed)
-    table = run_rigs(points, prior, settings.board, settings.estimate, sampling)
+    table = run_rigs(points, prior, drawn, settings.board, settings.estimate, sampling)
     write_parquet(table, folder / "points.parquet")
     write_json(folder / "summary.json", {"points": table.to_dicts()})
     axes = [name for name, values in settings.axes.items() if values and len(values) > 1]

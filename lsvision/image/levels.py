@@ -10,10 +10,10 @@ import numpy as np
 import torch
 import torch.nn.functional as F  # noqa: N812
 from jaxtyping import Bool, Float, Shaped
+from numpy.typing import NDArray
 from torch import Tensor
 
 from lsvision.image.brightness import gray, sampled_lines, white_level
-from lsvision.image.resampled import ResampledImage
 from lsvision.types import LineImage, StereoPair
 
 _NO_CODE = 2**32
@@ -25,6 +25,8 @@ _GROUP = 16  # neighbouring columns, by which the variation of one of them is ju
 # columns on both sides vary: at the edge of a dark area the range changes from column to column.
 _STUCK, _LIVELY, _LEAST_RANGE = 0.1, 0.5, 3.0
 _WILD, _LEAST_DIFFERENCE = 8.0, 0.02  # times the usual difference from a neighbour; of white
+# Share of the lines on which a column is above or below those on both sides of it: 2/3 where all is noise.
+_STANDS_OUT = 0.5
 
 
 @dataclass(frozen=True)
@@ -61,13 +63,24 @@ class CameraLevels:
 
     def unusable(self, lines: Shaped[Tensor, "lines width channels"]) -> Bool[Tensor, "lines width"] | None:
         """Which samples are saturated or from a faulty column; None where none is. Green decides for all colours."""
-        codes = cv2.extractChannel(lines.numpy(), _deciding_channel(lines))
-        if codes.max() < min(self.plateau, *self.tops, _NO_CODE) and not bool(self.faulty.any()):
+        saturated = self._saturated(cv2.extractChannel(lines.numpy(), _deciding_channel(lines)))
+        if saturated is None and not bool(self.faulty.any()):
             return None
-        bad = codes >= min(self.plateau, np.iinfo(codes.dtype).max)
+        faulty = self.faulty.expand(lines.shape[:2])
+        return faulty.contiguous() if saturated is None else torch.from_numpy(saturated) | faulty
+
+    def saturated(self, lines: Shaped[Tensor, "lines width channels"]) -> Bool[Tensor, "lines width channels"] | None:
+        """Which samples are saturated, each colour by itself; None where none is."""
+        saturated = self._saturated(lines.numpy())
+        return None if saturated is None else torch.from_numpy(saturated)
+
+    def _saturated(self, codes: NDArray) -> NDArray[np.bool_] | None:
+        if codes.size == 0 or codes.max() < min(self.plateau, *self.tops, _NO_CODE):
+            return None
+        bad: NDArray[np.bool_] = codes >= min(self.plateau, np.iinfo(codes.dtype).max)
         for top in self.tops:
             bad |= codes == top
-        return torch.from_numpy(bad | self.faulty.numpy())
+        return bad
 
 
 @dataclass(frozen=True)
@@ -81,14 +94,15 @@ class PairLevels:
     @classmethod
     def of(cls, pair: StereoPair) -> "PairLevels":
         """Read the levels of both images."""
-        left, right = (_as_taken(image) for image in (pair.left, pair.right))
+        left, right = (as_taken(image) for image in (pair.left, pair.right))
         white = white_level(left, right)
         return cls(white, CameraLevels.of(left, white), CameraLevels.of(right, white))
 
 
-def _as_taken(image: LineImage) -> LineImage:
-    """An image as the camera took it: of codes that are interpolated nothing can be read."""
-    return image.source if isinstance(image, ResampledImage) else image
+def as_taken(image: LineImage) -> LineImage:
+    """An image as the camera delivered it: of codes that were interpolated or divided by a gain nothing can be read."""
+    source: LineImage | None = getattr(image, "source", None)
+    return image if source is None else as_taken(source)
 
 
 def _deciding_channel(values: Shaped[Tensor, "lines width channels"]) -> int:
@@ -115,7 +129,8 @@ def _top_codes(dtype: torch.dtype, highest: int) -> tuple[int, ...]:
 def _faulty_columns(sampled: Float[Tensor, "lines width channels"], white: float) -> Bool[Tensor, " width"]:
     """Columns that do not vary along the scan although their neighbours do, or differ from both of them far more.
 
-    The median over the sampled lines is what counts: an edge of the object that crosses a column is no fault.
+    The median over the sampled lines is what counts: an edge of the object that crosses a column is no fault. Nor is
+    one that runs along a column: what lies on an edge is between the columns on both sides of it.
     """
     values = gray(sampled)
     ranges = values.amax(0) - values.amin(0)
@@ -124,7 +139,19 @@ def _faulty_columns(sampled: Float[Tensor, "lines width channels"], white: float
     steps = F.pad(_median_of_lines(values.diff(dim=1).abs()), (1, 1), value=torch.inf)
     difference = torch.minimum(steps[:-1], steps[1:])  # from the nearer neighbour
     wild = (difference > _WILD * _usual(difference, around=True)) & (difference > _LEAST_DIFFERENCE * white)
-    return stuck | wild
+    return _standing_out(values, stuck | wild)
+
+
+def _standing_out(values: Float[Tensor, "lines columns"], odd: Bool[Tensor, " columns"]) -> Bool[Tensor, " columns"]:
+    """The odd columns that do not lie between the nearest others on their left and on their right, as an edge does."""
+    columns, others = odd.nonzero()[:, 0], (~odd).nonzero()[:, 0]
+    after = torch.searchsorted(others, columns)
+    inside = (after > 0) & (after < len(others))
+    columns, after = columns[inside], after[inside]
+    own, left, right = values[:, columns], values[:, others[after - 1]], values[:, others[after]]
+    kept = odd.clone()
+    kept[columns] = ((own - left) * (own - right) > 0).float().mean(0) > _STANDS_OUT
+    return kept
 
 
 def _median_of_lines(values: Float[Tensor, "lines columns"]) -> Float[Tensor, " columns"]:

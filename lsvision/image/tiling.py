@@ -18,6 +18,8 @@ Result = TypeVar("Result")
 
 TILE = (512, 480)  # rows and columns; tall, because a tile sees more scan lines than it has rows
 
+_ROWS_AT_ONCE = 32  # of maps that are some thousand columns wide
+
 # Positions are rounded to this part of a pixel. Float32 holds such fractions exactly up to 8192 pixels, so that a
 # sample does not depend on the tile from which its position is counted.
 PIXEL_PARTS = 2048
@@ -83,6 +85,24 @@ def in_parallel(work: Callable[[Item], Result], items: Iterable[Item]) -> list[R
         return [future.result() for future in futures]
     finally:
         wait([future for future in futures if not future.cancel()])
+
+
+def by_rows(work: Callable[..., torch.Tensor], *maps: torch.Tensor) -> torch.Tensor:
+    """Result of a function of single rows, computed a few rows at a time.
+
+    A dozen passes over rows that stay in the processor's cache take half the time of passes over whole maps.
+
+    Args:
+        work: of the same rows of each map; returns values of the shape and type of the first one's.
+        maps: with as many rows each.
+    """
+    result = torch.empty_like(maps[0])
+
+    def write(rows: HaloRange) -> None:
+        result[rows.start : rows.stop] = work(*(values[rows.start : rows.stop] for values in maps))
+
+    in_parallel(write, halo_ranges(len(result), _ROWS_AT_ONCE, 0))
+    return result
 
 
 @functools.cache

@@ -1,32 +1,41 @@
 """The report of a reprocessed archive."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
-from lsvision.archive import ScanRow, product_path
+from lsvision.archive import Alarm, ScanRow, health_in_words, product_path
 from lsvision.io import read_product
 from lsvision.report import Headline, Page, ReportFigure, Table, write_report
 from lsvision.report.drawing import new_figure, show_image, thinned
+from lsvision.report.health_figures import health_figures, health_tables
+from lsvision.stages.health.config import HealthConfig
 
 _MAX_THUMBNAILS = 24
 _THUMBNAILS_ACROSS = 6
 _ROWS = 1024
 
 
-def reprocess_report(
-    rows: Mapping[str, ScanRow],
-    processed: Sequence[ScanRow],
-    output: Path,
-    seconds: float,
-    settings: dict,
-    folder: Path,
-) -> None:
-    """``report.html`` of a run: every scan of the archive, why some failed, and the first products that it made.
+@dataclass(frozen=True)
+class Run:
+    """A run over an archive: where its products lie, how long it took, its options, and the drifts it found."""
+
+    output: Path
+    seconds: float
+    settings: dict[str, Any]
+    health: HealthConfig
+    alarms: Sequence[Alarm] = ()
+
+
+def reprocess_report(rows: Mapping[str, ScanRow], processed: Sequence[ScanRow], run: Run, folder: Path) -> None:
+    """``report.html`` of a run: every scan of the archive, why some failed, drifts, and the first products it made.
 
     Args:
         rows: of all scans, as the ledger has them.
         processed: rows of those that this run processed.
     """
+    output, seconds = run.output, run.seconds
     failed = [row for row in rows.values() if row.status == "failed"]
     made = [row for row in processed if row.status == "done"]
     lines = sum(row.lines for row in made)
@@ -37,9 +46,11 @@ def reprocess_report(
         headlines=[
             Headline("Done", str(len(made)), "by this run"),
             Headline("Failed", str(len(failed)), f"of {len(rows)} scans"),
+            Headline("Drifts", str(len(run.alarms)), health_in_words(rows, run.alarms, run.health)),
             Headline("Lines", str(lines), f"in {seconds:.1f} s: {lines / max(seconds, 1e-9):.0f} lines per second"),
         ],
         tables=[
+            *health_tables(run.alarms),
             Table("Failed scans", ("scan", "reason"), [(row.scan, row.error) for row in failed]),
             Table(
                 "Scans",
@@ -55,8 +66,8 @@ def reprocess_report(
                 ],
             ),
         ],
-        figures=[_thumbnails(made, output)] if made else [],
-        settings=settings,
+        figures=[*health_figures(rows, run.alarms, run.health), *([_thumbnails(made, output)] if made else [])],
+        settings=run.settings,
     )  # fmt: skip
     write_report(page, folder)
 

@@ -14,6 +14,7 @@ from lsvision.report.calibration_figures import (
     rmse_by_iteration,
     stretch_by_iteration,
 )
+from lsvision.report.installation_pages import installation_sketch, installation_tables
 from lsvision.report.line_motion_figures import product_motion_figures
 from lsvision.report.line_motion_pages import findings_table
 from lsvision.report.line_motion_words import line_motion_words
@@ -61,6 +62,7 @@ def calibration_report(calibration: Calibration, boards: Sequence[BoardCorners],
                 f"the noise was scaled by {calibration.noise_scale:.3g}.",
             ),
             *board_motion_tables(calibration),
+            *installation_tables(calibration.installation),
         ],
         figures=[
             rmse_by_iteration(curves),
@@ -73,6 +75,7 @@ def calibration_report(calibration: Calibration, boards: Sequence[BoardCorners],
                 for index, board in enumerate(boards, start=1)
             ),
             *board_motion_figures(calibration, boards),
+            *installation_sketch(calibration.installation),
         ],
         settings=settings,
         provenance={

@@ -4,6 +4,8 @@ from pathlib import Path
 
 from lsvision.geometry import quantities_of
 from lsvision.report.drawing import AFTER, BEFORE, label_axes, new_figure
+from lsvision.report.installation_pages import installation_sketch, installation_tables
+from lsvision.report.installation_words import installation_lines
 from lsvision.report.pages import Headline, Page, ReportFigure, Table, write_report
 from lsvision.report.summary import drift_in_words
 from lsvision.types import RIG_QUANTITIES, RawRig, RigCalibration
@@ -22,12 +24,13 @@ def rig_summary(calibration: RigCalibration) -> str:
         f"  stretch      {calibration.motion.stretch:.6f}",
         f"  drift        {drift_in_words(calibration.motion)}",
     ]
+    lines += [f"  allowed for  {error.in_words}" for error in calibration.errors_along_scan]
     lines += [f"  because      {reason}" for reason in calibration.reasons if reason != calibration.advice]
     lines += [
         f"  not measured {item.in_words}: sigma stays at {item.share:.2f} of the data sheet's"
         for item in calibration.unobserved
     ]
-    return "\n".join([*lines, f"  next         {calibration.advice}"])
+    return "\n".join([*lines, f"  next         {calibration.advice}", *installation_lines(calibration.installation)])
 
 
 def rig_report(calibration: RigCalibration, start: RawRig, settings: dict, folder: Path) -> None:
@@ -47,8 +50,18 @@ def rig_report(calibration: RigCalibration, start: RawRig, settings: dict, folde
             Headline("Noise", f"{calibration.noise_scale:.2f}", "times the corners' stated sigmas"),
             Headline("Stretch", f"{calibration.motion.stretch:.6f}", "true over nominal travel"),
         ],
-        tables=[_quantities(calibration, start), _boards(calibration), *_combinations(calibration)],
-        figures=[_by("column", calibration), _by("depth", calibration), _coverage(calibration)],
+        tables=[
+            _quantities(calibration, start),
+            _boards(calibration),
+            *_combinations(calibration),
+            *installation_tables(calibration.installation),
+        ],
+        figures=[
+            _by("column", calibration),
+            _by("depth", calibration),
+            _coverage(calibration),
+            *installation_sketch(calibration.installation),
+        ],
         settings=settings,
         provenance={
             "configuration": f"sha256 {calibration.provenance.config_sha256}",

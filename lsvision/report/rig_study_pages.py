@@ -11,6 +11,7 @@ from lsvision.report.pages import Headline, Page, ReportFigure, Table, write_rep
 _MERITS = {
     "height_error_um": "heights off by [um]",
     "stated_um": "as stated [um]",
+    "over_bound": "over the Cramér-Rao bound",
     "nees": "NEES",
     "largest_z": "largest error [sigma]",
     "converged": "converged",
@@ -58,7 +59,11 @@ def _heights(points: polars.DataFrame, axes: Sequence[str]) -> ReportFigure:
     axis = axes[0] if axes else "boards"
     panel.loglog(points[axis], points["height_error_um"], "o", color=AFTER, label="error")
     panel.loglog(points[axis], points["stated_um"], "_", ms=14, color=BEFORE, label="as stated")
+    panel.loglog(points[axis], points["bound_um"], "x", ms=5, color="#555555", label="Cramér-Rao bound")
     label_axes(panel, "Heights of the field", axis.replace("_", " "), "rms error of heights [um]")
     figure.legend(loc="outside right upper", fontsize=9)
-    caption = "One mark is one point; where the two agree, a calibration says how good it is."
+    caption = (
+        "One mark is one point; where error and statement agree, a calibration says how good it is. "
+        "No calibration of the same scans is below the bound."
+    )
     return ReportFigure("heights", "Heights", caption, figure)

@@ -3,6 +3,7 @@
 import math
 from pathlib import Path
 
+from lsvision.report.installation_words import installation_lines
 from lsvision.types import BoardFit, Calibration, Motion
 
 
@@ -34,6 +35,7 @@ def calibration_summary(calibration: Calibration) -> str:
     ]
     if observability.advice:
         lines.append(f"  next         {observability.advice}")
+    lines += installation_lines(calibration.installation)
     return "\n".join(lines)
 
 

@@ -1,9 +1,13 @@
 """Options of a simulated scan: scene, motion, sensor, encoder."""
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
-from lsvision.schema import AcuteAngle, Checked, NonNegative, Positive, PositiveInt, Seed, Wavelengths
+from annotated_types import Ge, Le, Lt
+
+from lsvision.schema import AcuteAngle, Checked, NonNegative, Positive, PositiveInt, Seed, Share, Wavelengths
+
+Lights = Literal["beside", "along"]
 
 
 @dataclass(frozen=True)
@@ -16,9 +20,16 @@ class SceneConfig(Checked):
     from that depth. A corrugated rail rises and falls by ``corrugation_mm`` in a wave of ``corrugation_wavelength_mm``,
     whose phase is drawn from the seed and whose crests lie along the scan lines. The conveyor is a plane along the
     motion at the height ``-conveyor_drop_mm``; any target hides it.
+
+    A ``white`` reference is an endless white plane along the motion at that depth, with specks of dirt of about
+    ``dirt_mm`` on ``dirt_share`` of it; ``dark`` is a scan without light. Their length is ``rail_length_mm``, too.
+
+    ``lights`` stand ``beside`` the cameras, parallel to the motion, or ``along`` the sensor line, as on machines. Steel
+    of ``rail_gloss`` reflects them besides, each by that share of a white surface's brightness at most, the more
+    narrowly the larger ``rail_sharpness``: each camera sees the reflections at other places.
     """
 
-    kind: Literal["board", "sheet", "rail"] = "board"
+    kind: Literal["board", "sheet", "rail", "white", "dark"] = "board"
     pitch_deg: float = 0.0
     roll_deg: float = 0.0
     yaw_deg: float = 0.0
@@ -38,13 +49,23 @@ class SceneConfig(Checked):
     defect_spacing_mm: NonNegative = 120.0  # one scratch and one pit per length of rail; 0: none
     roll_mark_period_mm: NonNegative = 150.0  # circumference of the damaged roll; 0: none
     conveyor_drop_mm: float = 26.0  # of the conveyor under the plane of zero disparity
+    dirt_share: Share = 0.02  # of a white reference
+    dirt_mm: Positive = 1.5
+    lights: Lights = "beside"
+    rail_gloss: NonNegative = 0.0  # 0: matt
+    rail_sharpness: Positive = 60.0
     seed: Seed = 0
 
     def __post_init__(self) -> None:
         super().__post_init__()
         for key in ("pitch_deg", "yaw_deg"):
-            if self.kind == "rail" and getattr(self, key) != 0:
-                raise self.fault(key, f"expected 0, as a rail runs along the motion, got {getattr(self, key)}")
+            if self.is_endless and getattr(self, key) != 0:
+                raise self.fault(key, f"expected 0, as a {self.kind} runs along the motion, got {getattr(self, key)}")
+
+    @property
+    def is_endless(self) -> bool:
+        """Whether the object is the same along the whole scan."""
+        return self.kind in ("rail", "white", "dark")
 
 
 @dataclass(frozen=True)
@@ -68,7 +89,15 @@ class MotionConfig(Checked):
 
 @dataclass(frozen=True)
 class SensorConfig(Checked):
-    """The pair of line sensors and the optics before them."""
+    """The pair of line sensors and the optics before them.
+
+    A raw code is ``gain`` times that of an even camera, plus an offset. The gain falls off along the line by
+    ``vignetting`` from its middle to its ends, by the square of the distance; every column and colour departs from that
+    by ``gain_noise``, and from ``offset`` by ``offset_noise`` (standard deviations).
+
+    Lenses are in focus ``focus_height_mm`` over the plane of zero disparity, positive towards the cameras. A point that
+    lies off by 1 mm is blurred by ``defocus_px_per_mm`` (standard deviation) besides, up to 3 px.
+    """
 
     noise: NonNegative = 1.5  # standard deviation, of 255
     blur_px: NonNegative = 0.6  # standard deviation of the optics' point spread
@@ -77,7 +106,18 @@ class SensorConfig(Checked):
     mono: bool = False
     supersampling: PositiveInt = 3  # samples per pixel along the sensor, and per line along the motion
     color_registered: bool = True  # the camera has shifted its colour lines by their nominal spacing
+    vignetting: Annotated[float, Ge(0), Lt(1)] = 0.0  # share of the light lost at the ends of the line
+    gain_noise: Annotated[float, Ge(0), Lt(0.2)] = 0.0  # relative
+    offset: NonNegative = 0.0  # grey values, of 255
+    offset_noise: NonNegative = 0.0
+    defocus_px_per_mm: NonNegative = 0.0
+    focus_height_mm: float = 0.0
     seed: Seed = 0
+
+    @property
+    def is_even(self) -> bool:
+        """Whether all columns respond alike, without an offset."""
+        return not (self.vignetting or self.gain_noise or self.offset or self.offset_noise)
 
 
 @dataclass(frozen=True)
@@ -85,13 +125,15 @@ class EncoderConfig(Checked):
     """Unevenly triggered lines and the encoder's log of their positions.
 
     If ``enabled``, the true nominal position of a line swings by ``wobble_mm`` (rms) about the constant pitch. The log
-    is the true position plus white noise of ``noise_mm``.
+    is that position plus white noise of ``noise_mm``. Whether or not it is enabled, every line is triggered off its
+    place by a ``jitter`` (rms, as a share of the line pitch) that no log shows.
     """
 
     enabled: bool = False
     wobble_mm: NonNegative = 0.3
     wobble_wavelengths_mm: Wavelengths = (390.0, 151.0)
     noise_mm: NonNegative = 0.002
+    jitter: Annotated[float, Ge(0), Le(0.2)] = 0.0
     seed: Seed = 0
 
 

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from lsvision.simulation.config import SceneConfig
 from lsvision.simulation.defects import defects
-from lsvision.simulation.lighting import Lighting
+from lsvision.simulation.lighting import Facet, Lighting
 from lsvision.simulation.noise import Nodes, Octave, Raster, covering, lattice_hash, octaves, value_noise
 from lsvision.simulation.rail_profile import Hit, first_hit, head_60e1, slopes_from
 from lsvision.simulation.surfaces import Conveyor, Look, tinted
@@ -82,8 +82,13 @@ class RailScene:
         # A surface that falls inwards along s turns its normal by that slope towards +s.
         length = torch.rsqrt(1.0 + fall * fall)
         lit_x, lit_z = (normal_x - fall * normal_z) * length, (normal_z + fall * normal_x) * length
-        albedo = albedo * self.lighting.irradiance(rays.scan_x(z), z, lit_x, lit_z)
-        return Look(tinted(albedo[None], _TINT), z)
+        scan_x = rays.scan_x(z)
+        color = tinted((albedo * self.lighting.irradiance(scan_x, z, lit_x, lit_z))[None], _TINT)
+        if self.config.rail_gloss > 0:
+            facet = Facet(scan_x, z, lit_x, lit_z)
+            reflected = self.lighting.highlight(facet, rays.camera_x_mm, self.config.rail_sharpness)
+            color += self.config.rail_gloss * albedo * reflected  # scale and streaks dull it
+        return Look(color, z)
 
     def _bake(self, nodes: Nodes) -> Raster:
         """Reflectance, depth of the defects (mm) and its derivative along s, at nodes of (s, l)."""

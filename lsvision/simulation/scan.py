@@ -10,20 +10,21 @@ import torch
 from torch import Tensor
 
 from lsvision.errors import ConfigError
-from lsvision.geometry import Camera, RawPair, camera_center_mm, ideal_rig, project
+from lsvision.geometry import Camera, RawPair, camera_center_mm, ideal_rig, project, zero_disparity_mm
 from lsvision.schema import Checked, Positive, PositiveInt
 from lsvision.simulation.config import EncoderConfig, MotionConfig, SceneConfig, SensorConfig
 from lsvision.simulation.noise import lattice_hash
 from lsvision.simulation.scene import build_scene, place, scene_lines
-from lsvision.simulation.sensor import expose, halo_px, integrate, sample_offsets
+from lsvision.simulation.sensor import expose, halo_px, received, sample_offsets, true_response
 from lsvision.simulation.surfaces import Look, Scene
 from lsvision.simulation.trajectory import Trajectory, cast_rays
-from lsvision.types import Board, Pose, RawRig, Rig, Transport, Travel
+from lsvision.types import Board, CameraResponse, Pose, RawRig, Rig, Transport, Travel
 
 # Lines rendered at once. Blocks begin at multiples of it, so that strips of every height have the same bits; 32 lines
 # of samples fit the processor's cache.
 _BLOCK = 32
 _LOG_STREAM = 7
+_RESPONSE_STREAM = -1  # no line has this number
 
 
 @dataclass(frozen=True)
@@ -109,8 +110,9 @@ class Simulation:
     def truth(self) -> dict[str, Any]:
         """The truth of the scan as plain values for a JSON file.
 
-        ``n``, ``stretch``, ``R``, ``T``, ``lines``, the settings under ``args``, ``rig`` of raw cameras, and
-        for a board its corners as (column, line) in the order of ``Board.corner_points``.
+        ``n``, ``stretch``, ``R``, ``T``, ``lines``, the settings under ``args``, ``jitter_mm`` of every line where
+        there is one, ``rig`` of raw cameras, and for a board its corners as (column, line) in the order of
+        ``Board.corner_points``.
         """
         trajectory = self.trajectory
         args = {
@@ -129,12 +131,19 @@ class Simulation:
             "lines": self.lines,
             "args": args,
         }
+        if trajectory.encoder.jitter > 0:
+            truth["jitter_mm"] = trajectory.jitter(torch.arange(self.lines, dtype=torch.float64)).tolist()
         if self.raw_rig is not None:
             truth["rig"] = dataclasses.asdict(self.raw_rig)
         if self.scene.kind == "board":
             left, right = self.corners()
             truth |= {"corners_left_px": left.tolist(), "corners_right_px": right.tolist()}
         return truth
+
+    @property
+    def _focus_mm(self) -> float:
+        """Depth z at which the lenses are in focus."""
+        return zero_disparity_mm(self.rig) - self.sensor.focus_height_mm
 
     @cached_property
     def _scene(self) -> Scene:
@@ -144,9 +153,17 @@ class Simulation:
         reach = halo_px(self.sensor)
         columns = sample_offsets(-reach, self.width_px + 2 * reach, self.sensor)
         lines = sample_offsets(first - reach, _BLOCK + 2 * reach, self.sensor)
-        light = integrate(self._look(camera, columns, lines).color, self.sensor)
-        seed = lattice_hash(torch.tensor(first), int(camera == "right"), self.sensor.seed)
-        return expose(light, self.sensor, int((float(seed) + 1.0) * 2**30))
+        light = received(self._look(camera, columns, lines), self.sensor, self._focus_mm)
+        seed = self._drawn(first, int(camera == "right"))
+        return expose(light, self.sensor, seed, None if self.sensor.is_even else self.response(camera))
+
+    def response(self, camera: Camera) -> CameraResponse:
+        """True offset and gain of the columns of a camera, float32."""
+        return true_response(self.sensor, self.width_px, self._drawn(_RESPONSE_STREAM, int(camera == "right")))
+
+    def _drawn(self, number: int, stream: int) -> int:
+        """A seed by the number of a line and a stream."""
+        return int((float(lattice_hash(torch.tensor(number), stream, self.sensor.seed)) + 1.0) * 2**30)
 
     def _look(self, camera: Camera, columns: Tensor, lines: Tensor) -> Look:
         """Colour and depth that samples see; each colour of a trilinear sensor looks at another plane."""
@@ -199,7 +216,7 @@ def _logged_travel(trajectory: Trajectory, lines: int) -> Travel:
     encoder, pitch = trajectory.encoder, trajectory.line_pitch_mm
     if not encoder.enabled:
         return Travel(pitch, None, trajectory.transport)
-    position = trajectory.sign * trajectory.position(torch.arange(lines, dtype=torch.float64))
+    position = trajectory.sign * trajectory.logged(torch.arange(lines, dtype=torch.float64))
     generator = torch.Generator().manual_seed(encoder.seed * 8 + _LOG_STREAM)
     log = position + encoder.noise_mm * torch.randn(lines, generator=generator, dtype=torch.float64)
     if not bool((log.diff() > 0).all()):

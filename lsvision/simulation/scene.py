@@ -9,6 +9,7 @@ from lsvision.geometry import aligned_rotation, middle_point, rotation_from_vect
 from lsvision.simulation.config import SceneConfig
 from lsvision.simulation.lighting import line_lights
 from lsvision.simulation.rail import RailScene
+from lsvision.simulation.reference import ReferenceScene
 from lsvision.simulation.surfaces import BoardScene, Conveyor, Scene, SheetScene, squares_of
 from lsvision.types import Board, Pose, Rig
 
@@ -22,6 +23,8 @@ def place(rig: Rig, board: Board, scene: SceneConfig, n: Tensor, middle_mm: floa
     if scene.kind == "rail":
         rotation = aligned_rotation(n) @ _turn(0.0, scene.roll_deg, 0.0)
         return Pose(rotation, middle - scene.rail_rise_mm * _height_axis(n))
+    if scene.is_endless:
+        return Pose(aligned_rotation(n) @ _turn(0.0, scene.roll_deg, 0.0), middle)
     rotation = _turn(scene.pitch_deg, scene.roll_deg, scene.yaw_deg)
     outline = _outline(board, scene)
     center = torch.cat([outline.mean(0), outline.new_zeros(1)])
@@ -29,8 +32,8 @@ def place(rig: Rig, board: Board, scene: SceneConfig, n: Tensor, middle_mm: floa
 
 
 def scene_lines(board: Board, scene: SceneConfig, n: Tensor, line_pitch_mm: float) -> int:
-    """Lines of a scan that shows the whole target and its margin, or the length ``rail_length_mm`` of a rail."""
-    if scene.kind == "rail":
+    """Lines of a scan that shows the whole target and its margin, or ``rail_length_mm`` of an endless object."""
+    if scene.is_endless:
         return math.ceil(scene.rail_length_mm / line_pitch_mm)
     rotation = _turn(scene.pitch_deg, scene.roll_deg, scene.yaw_deg)
     travel = _outline(board, scene) @ rotation[1, :2] / n[1]
@@ -39,13 +42,15 @@ def scene_lines(board: Board, scene: SceneConfig, n: Tensor, line_pitch_mm: floa
 
 def build_scene(rig: Rig, board: Board, scene: SceneConfig, pose: Pose, n: Tensor) -> Scene:
     """Target, conveyor and lights; conveyor and rail run along the motion n."""
-    lighting = line_lights(rig)
+    lighting = line_lights(rig, scene.lights)
     ground = middle_point(rig) + scene.conveyor_drop_mm * _height_axis(n)
     conveyor = Conveyor(Pose(aligned_rotation(n), ground), lighting, scene.texture_mm, scene.seed)
     if scene.kind == "board":
         return BoardScene(board, scene, pose, lighting, conveyor)
     if scene.kind == "sheet":
         return SheetScene(scene, pose, lighting, conveyor)
+    if scene.kind in ("white", "dark"):
+        return ReferenceScene(scene, pose, lighting)
     return RailScene(scene, pose, lighting, conveyor)
 
 

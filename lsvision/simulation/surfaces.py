@@ -53,7 +53,7 @@ class Conveyor:
         nodes = covering(view.x, view.y, self.texture_mm, view.base_y)
         grain = value_noise(nodes, _OCTAVES, 8 * self.seed + 4).mul_(_CONVEYOR_CONTRAST).add_(1.0).clamp_(0.2, 2.0)
         albedo = Raster(grain[None], nodes).at(view.x, view.y, view.base_y)
-        return Look(tinted(albedo.mul_(_light(self.lighting, self.pose, view)), _CONVEYOR_TINT), view.z)
+        return Look(tinted(albedo.mul_(light_on(self.lighting, self.pose, view)), _CONVEYOR_TINT), view.z)
 
 
 @dataclass(frozen=True)
@@ -82,7 +82,7 @@ class BoardScene:
         # Black where column and row of a square, counted from the pattern's first corner, are both even or both odd.
         black = square_wave(x, side, width_x).mul_(square_wave(y, side, width_y)).add_(1.0).mul_(0.5 * (1.0 - _INK))
         black.mul_(coverage(x, -side, right, width_x)).mul_(coverage(y, -side, bottom, width_y))
-        albedo = self._grain.at(x, y).mul_(black.neg_().add_(1.0)).mul_(_light(self.lighting, self.pose, view))
+        albedo = self._grain.at(x, y).mul_(black.neg_().add_(1.0)).mul_(light_on(self.lighting, self.pose, view))
         return over(self.conveyor.look(rays), Look(tinted(albedo, _BOARD_TINT), view.z), inside)
 
     @cached_property
@@ -113,7 +113,7 @@ class SheetScene:
         x, y = view.x, view.y + view.base_y * self.config.texture_mm
         inside = coverage(x, 0.0, self.config.sheet_width_mm, footprint(x))
         inside *= coverage(y, 0.0, self.config.sheet_height_mm, footprint(y))
-        color = sheet_raster(self.config).at(x, y).mul_(_light(self.lighting, self.pose, view))
+        color = sheet_raster(self.config).at(x, y).mul_(light_on(self.lighting, self.pose, view))
         return over(self.conveyor.look(rays), Look(color, view.z), inside)
 
 
@@ -143,7 +143,7 @@ def tinted(albedo: Tensor, tint: tuple[float, float, float]) -> Tensor:
     return albedo * albedo.new_tensor(tint)[:, None, None]
 
 
-def _light(lighting: Lighting, pose: Pose, view: PlaneView) -> Tensor:
+def light_on(lighting: Lighting, pose: Pose, view: PlaneView) -> Tensor:
     """Brightness on a plane whose frame's Z points away from the cameras."""
     normal = -pose.rotation[:, 2]
     return lighting.irradiance(view.scan_x, view.z, float(normal[0]), float(normal[2]))

@@ -20,7 +20,7 @@ from lsvision.simulation.noise import lattice_hash
 from lsvision.types import Pose, Rig, Transport
 
 # One stream of random phases for each quantity that swings.
-_X, _Z, _ROLL, _WOBBLE = range(4)
+_X, _Z, _ROLL, _WOBBLE, _JITTER = range(5)
 # Fixed-point steps that invert the uneven travel; each gains a digit or more for any wobble that a log can follow.
 _INVERSION_STEPS = 40
 _CROSSING_STEPS = 8  # each gains two digits where a plane is tilted by half a degree
@@ -60,14 +60,29 @@ class Trajectory:
     def position(self, line: Tensor) -> Tensor:
         """True nominal travel y, mm, of (fractional) lines, float64."""
         even = line.double() * self.line_pitch_mm
-        return self.sign * (even + self._wobble(even))
+        return self.sign * (even + self._wobble(even) + self.jitter(line))
+
+    def logged(self, line: Tensor) -> Tensor:
+        """The travel of lines as an exact log has it, mm, float64: without the jitter."""
+        return self.position(line) - self.sign * self.jitter(line)
+
+    def jitter(self, line: Tensor) -> Tensor:
+        """By how much the trigger of lines is late, mm along the transport, float64; linear between whole lines."""
+        if self.encoder.jitter == 0:
+            return torch.zeros_like(line, dtype=torch.float64)
+        first = line.double().floor()
+        here, after = (
+            lattice_hash(number, _JITTER, self.encoder.seed).double() for number in (first.long(), first.long() + 1)
+        )
+        rms = self.encoder.jitter * self.line_pitch_mm
+        return math.sqrt(3.0) * rms * torch.lerp(here, after, line.double() - first)
 
     def line_at(self, y: Tensor) -> Tensor:
         """Fractional line of a true nominal travel y, mm: the inverse of ``position``."""
         target = self.sign * y.double()
         even = target
-        for _ in range(_INVERSION_STEPS if self.encoder.enabled else 0):
-            even = target - self._wobble(even)
+        for _ in range(_INVERSION_STEPS if self.encoder.enabled or self.encoder.jitter else 0):
+            even = target - self._wobble(even) - self.jitter(even / self.line_pitch_mm)
         return even / self.line_pitch_mm
 
     def vibration(self, line: Tensor) -> Tensor:
@@ -154,7 +169,8 @@ def cast_rays(trajectory: Trajectory, camera: Camera, columns: Tensor, lines: Te
         trajectory: the true motion.
         camera: "left" or "right".
         columns, lines: positions, px and lines.
-        plane_y_mm: Y of the plane that the sensor line sees; zero except for a trilinear sensor.
+        plane_y_mm: Y, at the depth of zero disparity, of the plane through the camera's centre that the sensor line
+            sees; zero except for a trilinear sensor.
     """
     rig, raw = trajectory.rig, trajectory.raw
     camera_x = camera_center_mm(rig, camera)
@@ -172,7 +188,8 @@ def cast_rays(trajectory: Trajectory, camera: Camera, columns: Tensor, lines: Te
     pivot = trajectory.pivot
     from_pivot_x, from_pivot_z = camera_x - pivot[0] - dx, -pivot[2] - dz
     origin = across * from_pivot_x[:, None] + depth * from_pivot_z[:, None] + pivot
-    origin = origin + origin.new_tensor([0.0, plane_y_mm, 0.0]) + trajectory.position(lines)[:, None] * trajectory.n
+    origin = origin + trajectory.position(lines)[:, None] * trajectory.n
+    depth = depth + depth.new_tensor([0.0, plane_y_mm / float(pivot[2]), 0.0])
     if raw is not None and camera == "right":
         # Along a ray, Y of its plane is linear in z and in the slope.
         up, none = origin.new_tensor([0.0, 1.0, 0.0]), origin.new_zeros(())

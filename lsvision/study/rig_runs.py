@@ -5,6 +5,7 @@ from dataclasses import asdict, dataclass
 
 import polars
 import torch
+from torch import Tensor
 
 from lsvision.geometry import ideal_rig, sharp_depth_mm
 from lsvision.report.progress import progress_bars
@@ -12,6 +13,7 @@ from lsvision.stages.rig.config import RigConfig
 from lsvision.stages.rig.height_shape import HeightShape
 from lsvision.stages.rig.model import SHARED, RigPrior, Shared
 from lsvision.stages.rig.solve import RigSolution, solve_rig
+from lsvision.study.rig_bound import least_factor
 from lsvision.study.rig_scans import RigConditions, rig_scans
 from lsvision.types import Board
 
@@ -27,11 +29,20 @@ class RigSampling:
 
 
 def run_rigs(
-    points: Sequence[RigConditions], prior: RigPrior, board: Board, config: RigConfig, sampling: RigSampling
+    points: Sequence[RigConditions],
+    prior: RigPrior,
+    drawn: RigPrior,
+    board: Board,
+    config: RigConfig,
+    sampling: RigSampling,
 ) -> polars.DataFrame:
     """One row per point: its conditions, and the figures of merit over its runs.
 
-    ``height_error_um`` is the rms bend of heights over the runs, ``stated_um`` that which the calibrations state;
+    Args:
+        prior: of the calibrations. drawn: distribution that the true rigs and motions are drawn from.
+
+    ``height_error_um`` is the rms bend of heights over the runs, ``stated_um`` that which the calibrations state,
+    ``bound_um`` the least that any estimate can have, and ``over_bound`` the first over the last;
     ``nees`` is the normalised error of all quantities and n, ``unknowns`` where the stated covariance is right;
     ``largest_z`` the largest error of any quantity in any run, in sigmas.
     """
@@ -45,19 +56,22 @@ def run_rigs(
             batches = []
             for first in range(0, sampling.runs, _BATCH):
                 count = min(_BATCH, sampling.runs - first)
-                scans = rig_scans(prior, board, conditions, count)
-                batches.append(_figures(solve_rig(scans.sightings, prior, config), scans.truth, shape))
+                scans = rig_scans(drawn, board, conditions, count)
+                solution = solve_rig(scans.sightings, prior, config)
+                bound = shape.stated_mm(least_factor(scans, prior, conditions.off * drawn.sigma / prior.sigma))
+                batches.append(_figures(solution, scans.truth, shape, bound))
                 bars.advance(bar, count)
             rows.append({**asdict(conditions), "runs": sampling.runs, **_merits(polars.concat(batches))})
     return polars.DataFrame(rows, infer_schema_length=None)
 
 
-def _figures(solution: RigSolution, truth: Shared, shape: HeightShape) -> polars.DataFrame:
+def _figures(solution: RigSolution, truth: Shared, shape: HeightShape, bound_mm: Tensor) -> polars.DataFrame:
     """One row per run."""
     error, covariance = solution.shared.vector - truth.vector, solution.covariance
     columns = {
         "bend_um": 1e3 * shape.bend_mm(error / solution.model.prior.sigma),
         "stated_um": 1e3 * shape.stated_mm(solution.found.factor),
+        "bound_um": 1e3 * bound_mm,
         "nees": (error * torch.linalg.solve(covariance, error)).sum(-1),
         "largest_z": (error / covariance.diagonal(dim1=-2, dim2=-1).sqrt()).abs().amax(-1),
         "noise_scale": solution.noise_scale,
@@ -68,10 +82,12 @@ def _figures(solution: RigSolution, truth: Shared, shape: HeightShape) -> polars
 
 def _merits(runs: polars.DataFrame) -> dict[str, float]:
     """Figures of merit over the runs of one point."""
-    bend, stated = ((polars.col(name) ** 2).mean().sqrt() for name in ("bend_um", "stated_um"))
+    bend, stated, bound = ((polars.col(name) ** 2).mean().sqrt() for name in ("bend_um", "stated_um", "bound_um"))
     found = runs.select(
         bend.alias("height_error_um"),
         stated.alias("stated_um"),
+        bound.alias("bound_um"),
+        (bend / bound).alias("over_bound"),
         polars.col("nees").mean(),
         polars.col("largest_z").max(),
         polars.col("noise_scale").mean(),

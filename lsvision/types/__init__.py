@@ -22,12 +22,14 @@ from lsvision.types.calibration import (
     Verdict,
     WhetherLineMotion,
 )
+from lsvision.types.installation import Installation, InstallationVerdict, LinePitch, PointShift, Turn
 from lsvision.types.line_motion import LINE_COMPONENTS, LineComponent, LineFinding, LineMotion
 from lsvision.types.product import (
     ProductGrid,
     ProductStrip,
 )
 from lsvision.types.raw_rig import RIG_QUANTITIES, RawCamera, RawRig, ViewPlane
+from lsvision.types.response import CameraResponse
 from lsvision.types.rig_calibration import CameraResiduals, RigBoard, RigCalibration, RigCombination, RigVerdict
 from lsvision.types.scan import (
     Board,
@@ -45,6 +47,7 @@ from lsvision.types.scan import (
     Travel,
     missing_ranges,
 )
+from lsvision.types.section import Section, SectionFit
 
 __all__ = [
     "LINE_COMPONENTS",
@@ -56,19 +59,24 @@ __all__ = [
     "Calibration",
     "CalibrationMethod",
     "CameraResiduals",
+    "CameraResponse",
     "Depth",
     "DepthSource",
     "DepthView",
     "ErrorAlongScan",
+    "Installation",
+    "InstallationVerdict",
     "Iteration",
     "LineComponent",
     "LineFinding",
     "LineImage",
     "LineMotion",
+    "LinePitch",
     "MissingLines",
     "Motion",
     "Observability",
     "ObservedDirection",
+    "PointShift",
     "Pose",
     "ProductGrid",
     "ProductStrip",
@@ -82,11 +90,14 @@ __all__ = [
     "RigCombination",
     "RigVerdict",
     "Scan",
+    "Section",
+    "SectionFit",
     "StereoPair",
     "StoredDepth",
     "TensorImage",
     "Transport",
     "Travel",
+    "Turn",
     "Verdict",
     "ViewPlane",
     "WhetherLineMotion",

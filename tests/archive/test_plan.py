@@ -3,11 +3,12 @@
 import sqlite3
 import threading
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import pytest
 
 from lsvision.archive import Ledger, ScanRow, StripRow, find_scans, ledger_lines, read_calibrations
+from lsvision.archive.health import ScanHealth
 from lsvision.archive.plan import plan_run, predicted_bytes, predicted_seconds
 from lsvision.archive.planned import IDLE_BYTES, rows_for_memory
 from lsvision.errors import FileFormatError, WriteError
@@ -107,7 +108,7 @@ def test_a_ledger_of_an_earlier_version_starts_anew(tmp_path, caplog):
         assert list(ledger.scans()) == ["b"]
 
 
-@pytest.mark.parametrize("version", [2, 3, 4])
+@pytest.mark.parametrize("version", [2, 3, 4, 5])
 def test_a_ledger_of_a_version_before_keeps_its_rows_and_gets_the_new_columns(tmp_path, caplog, version):
     path, row = tmp_path / "ledger.sqlite", ScanRow("a", "/a", "done", lines=7, version="v")
     with Ledger(path) as ledger:
@@ -117,6 +118,7 @@ def test_a_ledger_of_a_version_before_keeps_its_rows_and_gets_the_new_columns(tm
             3: ("verdict", "sideways_mm_per_m", "in_depth_mm_per_m", "drift_sigma_mm_per_m"),
             4: ("missing_lines",),
             5: ("line_motion", "rms_dx_mm", "rms_dz_mm", "rms_roll_rad", "rms_dy_mm"),
+            6: ("taken", *(item.name for item in fields(ScanHealth))),
         }
         for column in (column for later, columns in since.items() if later > version for column in columns):
             db.execute(f"ALTER TABLE scans DROP COLUMN {column}")

@@ -1,7 +1,6 @@
 """simulate -> calibrate -> correct -> validate with raw cameras, through files, at an eighth of the pixels."""
 
 import json
-import math
 
 import pytest
 import torch
@@ -13,16 +12,10 @@ from lsvision.stages.correction.config import CorrectionConfig
 from lsvision.stages.correction.correct import correct_scan
 from lsvision.stages.disparity.config import DisparityConfig
 from lsvision.stages.disparity.depth import depth_of
-from lsvision.types import RawCamera, RawRig, Rig, ViewPlane
+from lsvision.types import RawCamera, RawRig, Rig
 from tests.archive.archives import make_calibration
+from tests.raw_cameras import RAW
 
-TILT = math.radians(0.2)
-RAW = RawRig(
-    7142, 10.0, 354.0,
-    RawCamera(114.1, 3571.0, 0.2212, (0.012, -0.01)),
-    RawCamera(113.6, 3569.6, -0.2203, (-0.009, 0.006)),
-    ViewPlane(0.25, TILT, -TILT),
-)  # fmt: skip
 TILTS = {"a": (2.0, 1.5), "b": (-5.0, 1.0), "c": (4.0, -3.0)}
 
 

@@ -1,7 +1,6 @@
 """Raw pairs and their ideal ones: the oracle is where the raw cameras see points of a moving object."""
 
 import dataclasses
-import math
 
 import pytest
 import torch
@@ -16,14 +15,8 @@ from lsvision.geometry import (
     zero_disparity_mm,
 )
 from lsvision.types import RawCamera, RawRig, Rig, ViewPlane
+from tests.raw_cameras import RAW, TILT
 
-TILT = math.radians(0.2)
-RAW = RawRig(
-    7142, 10.0, 354.0,
-    RawCamera(114.1, 3571.0, 0.2212, (0.012, -0.01)),
-    RawCamera(113.6, 3569.6, -0.2203, (-0.009, 0.006)),
-    ViewPlane(0.25, TILT, -TILT),
-)  # fmt: skip
 PITCH_MM = 0.07
 DEPTHS_MM = (-26.9, 25.2)  # of the camera, about the plane of zero disparity
 N = torch.tensor([0.03, 1.02, -0.016], dtype=torch.float64)

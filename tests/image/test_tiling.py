@@ -7,7 +7,7 @@ import threading
 import pytest
 import torch
 
-from lsvision.image.tiling import HaloRange, halo_ranges, in_parallel, keep_freed_memory, tiles
+from lsvision.image.tiling import HaloRange, by_rows, halo_ranges, in_parallel, keep_freed_memory, tiles
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (192, 480), (193, 481), (500, 1300)])
@@ -24,6 +24,12 @@ def test_ranges_with_halo_by_hand() -> None:
     axis = list(range(11))
     for part in expected:
         assert axis[part.outer][part.inner] == axis[part.start : part.stop]
+
+
+@pytest.mark.parametrize("rows", [1, 32, 77])
+def test_few_rows_at_once_give_what_all_give(rows: int) -> None:
+    a, b = torch.randn(rows, 5), torch.randn(rows, 5)
+    assert torch.equal(by_rows(lambda x, y: x.cumsum(1) * y, a, b), a.cumsum(1) * b)
 
 
 @pytest.mark.parametrize("threads", [1, 3])

@@ -11,6 +11,8 @@ import torch
 from lsvision.io import ProductLayout, product_writer, read_product
 from lsvision.report import Headline, Page, ReportFigure, Table, calibration_report, product_report, write_report
 from lsvision.report.drawing import label_axes, new_figure
+from lsvision.stages.installation.config import InstallationConfig
+from lsvision.stages.installation.guide import Transported, installation_guide
 from lsvision.types import ProductGrid, ProductStrip, Provenance
 
 NASTY = "<script>alert('x')</script> & \"quotes\""
@@ -111,6 +113,19 @@ def test_calibration_report(tmp_path, determined, corners):
     assert "1.020427" in page.text
     assert "± 4.0e-05 mm per mm" in page.text
     assert len(list((tmp_path / "figures").glob("*.png"))) == len(list((tmp_path / "figures").glob("*.svg"))) == 7
+
+
+def test_calibrations_without_a_guide_have_no_sketch(tmp_path, dominated, corners):
+    calibration_report(dominated, [corners, corners], {}, tmp_path)
+    assert "Align the cameras" not in (tmp_path / "report.html").read_text()
+
+
+def test_calibrations_with_a_guide_say_what_to_turn(tmp_path, determined, corners):
+    guide = installation_guide(determined.motion, 0.05, Transported(0.07), InstallationConfig())
+    calibration_report(dataclasses.replace(determined, installation=guide), [corners, corners], {}, tmp_path)
+    page = read_page(tmp_path)
+    assert "the end at the larger columns moves to where the object comes from (+1.46" in page.text
+    assert (tmp_path / "figures" / "installation.png").exists()
 
 
 @pytest.mark.drawn

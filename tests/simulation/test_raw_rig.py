@@ -1,7 +1,6 @@
 """Raw cameras in the renderer: where they see corners, and what their files say."""
 
 import dataclasses
-import math
 
 import pytest
 import torch
@@ -9,16 +8,11 @@ import torch
 from lsvision.geometry import RawPair, ideal_rig, scaled_raw_rig, transform
 from lsvision.image.board.detect import detect_board
 from lsvision.simulation import Acquisition, EncoderConfig, MotionConfig, SceneConfig, SensorConfig, simulate
-from lsvision.types import Board, RawCamera, RawRig, TensorImage, ViewPlane
+from lsvision.types import Board, RawCamera, RawRig, TensorImage
+from tests.raw_cameras import RAW as PLAIN
 
 BOARD = Board(12, 9, 30.0)
-RAW = RawRig(
-    7142, 10.0, 354.0,
-    RawCamera(114.1, 3571.0, 0.2212, (0.012, -0.01)),
-    RawCamera(113.6, 3569.6, -0.2203, (-0.009, 0.006)),
-    ViewPlane(0.25, math.radians(0.2), math.radians(-0.2)),
-    (-4.0, 0.0, 4.0),
-)  # fmt: skip
+RAW = dataclasses.replace(PLAIN, color_spacing_lines=(-4.0, 0.0, 4.0))
 TILTED = SceneConfig(pitch_deg=3.0, roll_deg=-2.0, yaw_deg=92.0)
 MOTION = MotionConfig(angle_x_deg=-1.5, angle_z_deg=0.8, stretch=1.0246)
 

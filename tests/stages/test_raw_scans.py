@@ -13,7 +13,8 @@ from lsvision.stages.correction.grid import plan_product
 from lsvision.stages.disparity.depth import depth_of
 from lsvision.stages.measurement import measure_board
 from lsvision.types import Motion, Scan, StereoPair, TensorImage
-from tests.stages.disparity.test_rectify import FULL_RAW, error_px
+from tests.raw_cameras import RAW
+from tests.stages.disparity.test_rectify import error_px
 from tests.stages.rendered import BOARD, MOTION
 
 SCALE = 4
@@ -22,7 +23,7 @@ UM_PER_PX = 157.6 * SCALE
 
 def rendered(scene: SceneConfig) -> tuple[Simulation, Scan]:
     source = simulate(
-        scaled_raw_rig(FULL_RAW, SCALE), BOARD, scene, MOTION, SensorConfig(), Acquisition(0.07 * SCALE)
+        scaled_raw_rig(RAW, SCALE), BOARD, scene, MOTION, SensorConfig(), Acquisition(0.07 * SCALE)
     )  # fmt: skip
     images = StereoPair(*(TensorImage(torch.cat(list(source.strips(camera)))) for camera in ("left", "right")))
     return source, Scan(Path("raw"), source.rig, source.travel, images, raw_rig=source.raw_rig)
@@ -52,5 +53,5 @@ def test_corrected_board():
     color, height = (torch.cat([getattr(strip, name) for strip in strips]) for name in ("color", "height"))
     board = measure_board(TensorImage(color), TensorImage(height[..., None]), grid, BOARD)
     assert board is not None
-    assert int(board.valid.sum()) >= 50  # black squares have no texture; of a rectified pair 70 are measured
+    assert int(board.valid.sum()) >= 85
     assert board.distance_rms_mm < 0.06

@@ -11,6 +11,7 @@ from pathlib import Path
 
 from lsvision.errors import ConfigError, FileFormatError
 from lsvision.io.formats.scan import FILE_KEYS, SCAN_FILE
+from lsvision.io.formats.scan_files import response_files
 from lsvision.io.formats.validation import on_one_line, read_yaml
 from lsvision.io.inside import path_inside
 
@@ -130,6 +131,12 @@ def _problem_of_copy(place: Path, root: Path) -> str | None:
             path_inside(root, place / str(named.get(key, "")))
         except FileFormatError:
             return f"{SCAN_FILE}: {key}: leads outside the archive"
+    rig = place / str(named.get("rig", ""))
+    for file in response_files(rig):
+        try:
+            path_inside(root, file)
+        except FileFormatError:
+            return f"{rig.name}: response: leads outside the archive"
     return None
 
 

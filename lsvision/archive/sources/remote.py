@@ -14,6 +14,7 @@ from fsspec.implementations.local import LocalFileSystem
 from lsvision.archive.sources.catalogue import COPIES_FILE, PATTERN_SIGNS, SCAN_FILE
 from lsvision.errors import ConfigError, FileFormatError, LsvisionError
 from lsvision.io import write_json
+from lsvision.io.formats.rig import CAMERAS
 from lsvision.io.formats.validation import YAML_BYTES, parse_yaml
 from lsvision.io.inside import path_inside
 
@@ -100,7 +101,8 @@ def _fixed_part(place: str) -> str:
 def _files_of(files: fsspec.AbstractFileSystem, scans: list[str], place: str) -> tuple[dict[str, dict[str, Any]], str]:
     """Every file of some scans with what is known of it, and the folder that holds all: the archive's root.
 
-    The rigs beside or above the scans are among them, where they lie in the archive too.
+    The rigs beside or above the scans, and the responses that they name, are among them, where they lie in the archive
+    too.
     """
     parents = [posixpath.dirname(posixpath.dirname(scan)) for scan in scans]
     limit = _common([place, *parents])
@@ -135,14 +137,25 @@ def _stamp(details: dict[str, Any]) -> str:
 
 
 def _rigs(files: fsspec.AbstractFileSystem, scans: list[str]) -> Iterator[str]:
-    """The paths of the rigs that scans name."""
+    """The paths of the rigs that scans name, and of the responses that these name."""
     for scan in scans:
-        if (files.info(scan).get("size") or 0) > YAML_BYTES:
+        rig = _entries(files, scan).get("rig")
+        if not isinstance(rig, str):
             continue
-        try:
-            values = parse_yaml(files.cat_file(scan).decode("utf-8"), scan)
-        except (UnicodeDecodeError, FileFormatError):
-            continue  # reported where the scan is read
-        rig = values.get("rig") if isinstance(values, dict) else None
-        if isinstance(rig, str):
-            yield posixpath.normpath(posixpath.join(posixpath.dirname(scan), rig))
+        path = posixpath.normpath(posixpath.join(posixpath.dirname(scan), rig))
+        yield path
+        named = _entries(files, path).get("response")
+        for name in (named.get(camera) for camera in CAMERAS) if isinstance(named, dict) else ():
+            if isinstance(name, str):
+                yield posixpath.normpath(posixpath.join(posixpath.dirname(path), name))
+
+
+def _entries(files: fsspec.AbstractFileSystem, path: str) -> dict[str, Any]:
+    """The entries of a YAML file; none where it is reported when the scan is read."""
+    if path.startswith("..") or not files.exists(path) or (files.info(path).get("size") or 0) > YAML_BYTES:
+        return {}
+    try:
+        values = parse_yaml(files.cat_file(path).decode("utf-8"), path)
+    except (UnicodeDecodeError, FileFormatError):
+        return {}
+    return values if isinstance(values, dict) else {}

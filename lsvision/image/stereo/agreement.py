@@ -1,10 +1,14 @@
 """Consistency of the left view's disparities with the right view: agreement, occlusion, and filling of gaps."""
 
+import functools
+
 import numpy as np
 import torch
 import torch.nn.functional as F  # noqa: N812
 from jaxtyping import Bool, Float
 from torch import Tensor
+
+from lsvision.image.tiling import by_rows
 
 _DISPARITIES = 4096  # cost and whole disparity are coded as one integer: cost * 4096 + 2048 + disparity
 _NO_CLAIM = 2**30
@@ -22,6 +26,10 @@ def agreeing(
         disparity: px, within ±2000, NaN for none.
         cost: whole numbers from 0 to 255.
     """
+    return by_rows(functools.partial(_agreeing_rows, limit_px=limit_px), disparity, cost)
+
+
+def _agreeing_rows(disparity: Tensor, cost: Tensor, limit_px: float) -> Tensor:
     whole = torch.nan_to_num(disparity).round()
     partner, inside = _partner(disparity, whole)
     claim = torch.where(inside, torch.add(whole, cost, alpha=_DISPARITIES).add_(_DISPARITIES / 2), _NO_CLAIM).to(
@@ -78,5 +86,5 @@ def _partner(disparity: Tensor, whole: Tensor) -> tuple[Tensor, Tensor]:
     """Column of the partner in the right image, clamped to it, and whether it lies inside."""
     width = disparity.shape[1]
     column = torch.arange(width, dtype=whole.dtype) - whole
-    inside = torch.isfinite(disparity) & (column >= 0) & (column < width)
+    inside = (disparity == disparity) & (column >= 0) & (column < width)
     return column.clamp(0, width - 1).long(), inside

@@ -26,6 +26,7 @@ from lsvision.image.stereo.best_match import BestMatch, stretches
 from lsvision.image.stereo.blocks import enlarged, repeated
 from lsvision.image.stereo.refine import RefineOptions, refine_disparity
 from lsvision.image.stereo.sgbm import GrayPair, Search, match_sgbm
+from lsvision.image.tiling import by_rows
 
 BLOCK = 2  # pixels along the side of the blocks that get a disparity
 COARSEST = 4  # size of the full image over that of the smallest copy; strips should start at multiples of it
@@ -177,7 +178,11 @@ def _refined_where(pair: GrayPair, disparity: Tensor, where: Tensor, options: Re
 
 def _within_range(disparity: Tensor, search: Search, width: int) -> Tensor:
     """Disparity of blocks without those outside of the range or with a partner outside of the image, ``width`` px."""
-    partner = BLOCK * torch.arange(disparity.shape[1]) + (BLOCK - 1) / 2 - disparity
-    # Both columns of a block: the lowest partner is 0, the highest width - 1.
-    has_partner = (partner - (width - 1) / 2).abs_() <= (width - BLOCK) / 2
-    return torch.where(search.contains(disparity) & has_partner, disparity, torch.nan)
+    column = BLOCK * torch.arange(disparity.shape[1]) + (BLOCK - 1) / 2
+
+    def within(rows: Tensor) -> Tensor:
+        # Both columns of a block: the lowest partner is 0, the highest width - 1.
+        has_partner = (column - rows).sub_((width - 1) / 2).abs_() <= (width - BLOCK) / 2
+        return torch.where(search.contains(rows) & has_partner, rows, torch.nan)
+
+    return by_rows(within, disparity)

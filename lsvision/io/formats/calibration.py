@@ -8,7 +8,9 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from lsvision.errors import CalibrationError, FileFormatError
+from lsvision.errors import FileFormatError
+from lsvision.io.formats.installation import installation_to_dict
+from lsvision.io.formats.raw_rig import RawRigEntries, raw_rig_to_dict
 from lsvision.io.formats.rig import RigEntries, rig_to_dict
 from lsvision.io.formats.validation import Matrix, Triple, read_entries, read_json
 from lsvision.io.json_file import write_json
@@ -25,7 +27,6 @@ from lsvision.types import (
     ObservedDirection,
     Pose,
     Provenance,
-    Scan,
     Verdict,
 )
 
@@ -114,7 +115,7 @@ class ProvenanceEntries(Checked):
 
 @dataclass(frozen=True)
 class CalibrationEntries(Checked):
-    """The entries of ``calibration.json``; the improvement follows from the two RMSE and is accepted as it is.
+    """The entries of ``calibration.json``; the improvement and the installation follow and are accepted as they are.
 
     Files of earlier versions lack ``verdict``, ``reasons``, ``noise_scale`` and ``errors_along_scan``.
     """
@@ -129,6 +130,7 @@ class CalibrationEntries(Checked):
     observability: ObservabilityEntries
     rig: RigEntries
     provenance: ProvenanceEntries
+    raw_rig: RawRigEntries | None = None
     verdict: Verdict | None = None
     reasons: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
@@ -136,6 +138,7 @@ class CalibrationEntries(Checked):
     errors_along_scan: tuple[ErrorAlongScan, ...] = ()
     converged: bool | None = None
     improvement: object = None
+    installation: object = None
 
 
 def write_calibration(calibration: Calibration, path: Path | str) -> None:
@@ -165,7 +168,9 @@ def write_calibration(calibration: Calibration, path: Path | str) -> None:
             "directions": [asdict(item) for item in observability.directions],
             "advice": observability.advice,
         },
+        "installation": installation_to_dict(calibration.installation),
         "rig": rig_to_dict(calibration.rig),
+        **({} if calibration.raw_rig is None else {"raw_rig": raw_rig_to_dict(calibration.raw_rig)}),
         "provenance": {
             "version": provenance.version,
             "config_sha256": provenance.config_sha256,
@@ -199,26 +204,13 @@ def read_calibration(path: Path | str) -> Calibration:
         boards=tuple(board.fit() for board in entries.boards),
         observability=observability,
         rig=entries.rig.rig(),
+        raw_rig=None if entries.raw_rig is None else entries.raw_rig.rig(),
         provenance=Provenance(
             version=entries.provenance.version,
             config_sha256=entries.provenance.config_sha256,
             scans=tuple((scan.path, scan.sha256) for scan in entries.provenance.scans),
         ),
     )
-
-
-def check_rig_match(calibration: Calibration, scan: Scan) -> None:
-    """Check that a calibration was made with the rig of a scan.
-
-    Raises:
-        CalibrationError: the rigs differ; names the scan and the first differing entry.
-    """
-    for item in fields(calibration.rig):
-        ours, theirs = getattr(calibration.rig, item.name), getattr(scan.rig, item.name)
-        if ours != theirs:
-            raise CalibrationError(
-                f"{scan.path}: the calibration is for another rig: {item.name} {ours}, the scan's is {theirs}"
-            )
 
 
 def motion_to_dict(motion: Motion) -> dict[str, object]:

@@ -4,7 +4,7 @@ import hashlib
 from pathlib import Path
 
 from lsvision.errors import FileFormatError
-from lsvision.io.formats.scan import scan_files
+from lsvision.io.formats.scan_files import scan_files
 
 _BLOCK = 1 << 20
 

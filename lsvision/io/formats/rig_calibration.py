@@ -4,6 +4,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 from lsvision.io.formats.calibration import motion_to_dict
+from lsvision.io.formats.installation import installation_to_dict
 from lsvision.io.formats.raw_rig import raw_rig_to_dict
 from lsvision.io.json_file import write_json
 from lsvision.types import RIG_QUANTITIES, RigBoard, RigCalibration
@@ -24,9 +25,11 @@ def write_rig_calibration(calibration: RigCalibration, path: Path | str) -> None
         "reasons": list(calibration.reasons),
         "advice": calibration.advice,
         "noise_scale": calibration.noise_scale,
+        "errors_along_scan": [asdict(item) for item in calibration.errors_along_scan],
         "height_error_um": calibration.height_error_um,
         "rig": raw_rig_to_dict(calibration.rig),
         "motion": motion_to_dict(calibration.motion),
+        "installation": installation_to_dict(calibration.installation),
         "covariance": {"of": [*RIG_QUANTITIES, "n1", "n2", "n3"], "values": calibration.covariance.tolist()},
         "unobserved": [
             {"parts": dict(item.parts), "share": item.share, "bend_um": item.bend_um} for item in calibration.unobserved

@@ -15,6 +15,7 @@ from lsvision.io.atomic import partial_folder, write_text
 from lsvision.io.formats.encoder import read_encoder_log, write_encoder
 from lsvision.io.formats.line_motion import read_line_motion, write_line_motion
 from lsvision.io.formats.raw_rig import read_rig_pair, write_raw_rig
+from lsvision.io.formats.response import made_even, write_response
 from lsvision.io.formats.rig import write_rig
 from lsvision.io.formats.validation import named_file, read_entries, read_yaml
 from lsvision.io.images.depth_map import PlausibleDepth
@@ -23,6 +24,7 @@ from lsvision.io.images.tiff import write_line_image
 from lsvision.io.json_file import write_json
 from lsvision.schema import Checked, Positive, Says, Text
 from lsvision.types import (
+    CameraResponse,
     DepthView,
     LineImage,
     LineMotion,
@@ -67,7 +69,8 @@ class NewScan:
     ``left``, ``right`` and ``depth`` are strips ``(lines, width, channels)`` of any height, each image taken to its end
     before the next; exactly one of right and depth is given. Depth is float32 z, mm, one channel, NaN where there is
     none. The images are as wide as the rig's, and those of ``raw_rig`` where there is one, which is written in place of
-    ``rig``. ``extra_json`` is plain data by file name, written beside the scan ("truth.json").
+    ``rig``. ``extra_json`` is plain data by file name, written beside the scan ("truth.json"), ``responses`` are those
+    of cameras, which nothing names.
 
     Raises:
         ValueError: not exactly one of right and depth, or a log of another length.
@@ -86,6 +89,7 @@ class NewScan:
     line_motion: LineMotion | None = None
     raw_rig: RawRig | None = None
     extra_json: Mapping[str, dict] = field(default_factory=dict)
+    responses: Mapping[str, CameraResponse] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if (self.right is None) == (self.depth is None):
@@ -118,13 +122,20 @@ class NewScan:
         )
 
 
-def read_scan(path: Path | str, *, repair_encoder: bool = False, missing_lines: MissingLines = "refuse") -> Scan:
+def read_scan(
+    path: Path | str,
+    *,
+    repair_encoder: bool = False,
+    missing_lines: MissingLines = "refuse",
+    as_taken: bool = False,
+) -> Scan:
     """Open a scan; its images are read later, by line ranges.
 
     Args:
         path: the folder, or its ``scan.yaml``.
         repair_encoder: interpolate faulty lines of the encoder log instead of raising.
         missing_lines: with "mark" images may lack frames or chunks, whose lines count as missing.
+        as_taken: leave out the response that the rig may name: the images are the cameras' raw codes.
 
     Raises:
         FileFormatError: a file is missing, not what it should be, or does not fit the others.
@@ -143,6 +154,8 @@ def read_scan(path: Path | str, *, repair_encoder: bool = False, missing_lines: 
         raise FileFormatError(
             file, "expected the rectified rig that the depth was computed with, lsvision-rig/1", "rig"
         )
+    if not as_taken:
+        images |= made_even(files["rig"], cameras.response, images)
     left = images["left"]
     if "depth" in images:
         images["depth"] = _plausible_depth(file, rig, images["depth"])
@@ -166,23 +179,6 @@ def read_scan(path: Path | str, *, repair_encoder: bool = False, missing_lines: 
         line_motion=read_line_motion(shaken, left.shape[0], travel) if shaken else None,
         raw_rig=cameras.raw,
     )
-
-
-def scan_files(folder: Path | str) -> list[Path]:
-    """The files that make a scan, in a fixed order: ``scan.yaml``, and every file or folder that it names.
-
-    A name whose file is missing is listed as well.
-
-    Raises:
-        FileFormatError: ``scan.yaml`` cannot be read.
-    """
-    folder = Path(folder)
-    data = read_yaml(folder / SCAN_FILE)
-    entries = data if isinstance(data, Mapping) else {}
-    files = [folder / SCAN_FILE]
-    for named in (folder / str(entries[key]) for key in FILE_KEYS if entries.get(key) is not None):
-        files += sorted(file for file in named.rglob("*") if file.is_file()) if named.is_dir() else [named]
-    return files
 
 
 def write_scan(folder: Path | str, scan: NewScan) -> None:
@@ -212,6 +208,8 @@ def write_scan(folder: Path | str, scan: NewScan) -> None:
             write_line_motion(scan.line_motion, partial / "motion.parquet")
         for name, content in scan.extra_json.items():
             write_json(partial / name, content, strict=True)
+        for name, response in scan.responses.items():
+            write_response(response, partial / name)
         entries = {key: value for key, value in asdict(scan.entries()).items() if value is not None}
         write_text(partial / SCAN_FILE, yaml.safe_dump(entries, sort_keys=False))
 

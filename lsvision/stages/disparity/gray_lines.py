@@ -7,7 +7,8 @@ from jaxtyping import Bool, Shaped
 from torch import Tensor
 
 from lsvision.image.brightness import gray, gray_bytes
-from lsvision.image.levels import CameraLevels
+from lsvision.image.flat_field import FlatFieldImage
+from lsvision.image.levels import CameraLevels, as_taken
 from lsvision.image.resampled import ResampledImage
 from lsvision.types import LineImage
 
@@ -28,16 +29,25 @@ class GrayLines:
         """
         if isinstance(image, ResampledImage):
             return cls._resampled(image, lines, levels, white)
-        codes = _read_within(image, lines)
+        return cls._of(image, _read_within(as_taken(image), lines), levels, white)
+
+    @classmethod
+    def _of(cls, image: LineImage, codes: Tensor, levels: CameraLevels, white: float) -> "GrayLines":
+        """Those of codes as the camera delivered them; made even where the image is."""
         unusable = levels.unusable(codes)
-        return cls(_gray(codes, white), unusable)
+        if not isinstance(image, FlatFieldImage):
+            return cls(_gray(codes, white), unusable)
+        if image.blind is not None:
+            blind = image.blind.expand(codes.shape[:2])
+            unusable = blind.contiguous() if unusable is None else unusable | blind
+        return cls(_gray(image.values(codes), white), unusable)
 
     @classmethod
     def _resampled(cls, image: ResampledImage, lines: range, levels: CameraLevels, white: float) -> "GrayLines":
         taken = image.source_lines(lines)
-        codes = image.source.read(taken.start, taken.stop)
-        bad = levels.unusable(codes)
-        brightness = image.resample(_gray(codes, white)[..., None], taken.start, lines)[..., 0]
+        source = cls._of(image.source, as_taken(image).read(taken.start, taken.stop), levels, white)
+        brightness = image.resample(source.gray[..., None], taken.start, lines)[..., 0]
+        bad = source.unusable
         return cls(brightness, None if bad is None else image.spread(bad, taken.start, lines))
 
 

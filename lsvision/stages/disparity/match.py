@@ -18,7 +18,7 @@ from lsvision.image.stereo.relation import PairRelation, measure_relation
 from lsvision.image.stereo.residuals import Misfit, usual_variance
 from lsvision.image.stereo.sgbm import GrayPair, Search, match_sgbm
 from lsvision.image.stereo.steps import step_evidence
-from lsvision.image.tiling import HaloRange
+from lsvision.image.tiling import HaloRange, by_rows
 from lsvision.stages.disparity.config import COARSE_TO_FINE_PX, DisparityConfig
 from lsvision.stages.disparity.gray_lines import GrayLines
 from lsvision.types import Rig, StereoPair, TensorImage
@@ -163,11 +163,15 @@ def _measure(
         factor = factor * holes_factor(searched, disparity, options.window_blocks(block))
     lowest_px = float(disparity_range(rig, config)[0])
     steps = step_evidence(left, right, own, misfit.noise_variance, lowest_px)
-    own, variance = own.masked_fill(steps.refuted, torch.nan), steps.variance
-    if light_variance is not None:
-        variance.add_(light_variance)
-    sigma = variance.addcmul_(factor, refined.sigma.square()).sqrt_().add_(own - own)  # NaN where the disparity is
+    own = by_rows(lambda values, refuted: values.masked_fill(refuted, torch.nan), own, steps.refuted)
+    variance = steps.variance if light_variance is None else steps.variance.add_(light_variance)
+    sigma = by_rows(_sigma, variance, factor, refined.sigma, own)
     return StripMatch(enlarged(own, block)[:lines, :width], repeated(sigma, block)[:lines, :width])
+
+
+def _sigma(variance: Tensor, factor: Tensor, refined: Tensor, disparity: Tensor) -> Tensor:
+    """Sigma with a variance besides that of the refinement, which grows by a factor; NaN where the disparity is."""
+    return torch.addcmul(variance, factor, refined * refined).sqrt_().add_(disparity - disparity)
 
 
 def _search(left: Tensor, right: Tensor, rig: Rig, config: DisparityConfig) -> Tensor:

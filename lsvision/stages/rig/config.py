@@ -2,20 +2,16 @@
 
 from dataclasses import dataclass
 
-from lsvision.schema import Checked, NonNegative, Positive, PositiveInt
+from lsvision.schema import Checked, NonNegative, Positive, PositiveInt, PositiveOrInfinite
 
 
 @dataclass(frozen=True)
-class RigConfig(Checked):
-    """How a raw rig is estimated from scans of boards.
+class RigSigmas(Checked):
+    """Standard deviations of a rig about its data sheet, where its file states none.
 
-    The rig of the data sheet is the prior, with the standard deviations of its file where it states them and these
-    elsewhere: ``focal_length_share`` and ``baseline_share`` of the focal lengths and the baseline,
-    ``principal_sigma_px``, ``turn_sigma_deg``, ``distortion_sigma`` of k1 and k2, and of the right
-    camera's plane ``plane_sigma_mm`` and ``plane_slope_sigma``. ``motion_sigma`` is that of each component of n about
-    (0, 1, 0). A corner further off than ``outlier_sigma`` of its standard deviations, as they turn out, is left out.
-    A combination of quantities counts as observed where its sigma is at most ``observed_share`` of the prior's, and
-    matters where it alone bends the heights of the field by ``least_height_um`` (rms) or more.
+    ``focal_length_share`` and ``baseline_share`` are of the focal lengths and the baseline, ``distortion_sigma`` of k1
+    and k2, ``plane_sigma_mm`` and ``plane_slope_sigma`` of the right camera's plane. ``motion_sigma`` is that of each
+    component of n about (0, 1, 0).
     """
 
     focal_length_share: Positive = 0.01
@@ -26,6 +22,20 @@ class RigConfig(Checked):
     plane_sigma_mm: Positive = 1.0
     plane_slope_sigma: Positive = 0.01
     motion_sigma: Positive = 0.05
+
+
+@dataclass(frozen=True)
+class RigConfig(RigSigmas):
+    """How a raw rig is estimated from scans of boards.
+
+    The rig of the data sheet is the prior, with the standard deviations of its file where it states them and those of
+    ``RigSigmas`` elsewhere. A corner further off than ``outlier_sigma`` of its standard deviations, as they turn out,
+    is left out. A combination of quantities counts as observed where its sigma is at most ``observed_share`` of the
+    prior's, and matters where it alone bends the heights of the field by ``least_height_um`` (rms) or more.
+    Errors that all corners of a line share, as of an object that shakes, are allowed for where they make the corners
+    ``correlated_odds`` times as probable; infinite: never.
+    """
+
     outlier_sigma: Positive = 5.0
     max_iterations: PositiveInt = 30
     tolerance: Positive = 0.01  # length of the last step, in sigmas; forward derivatives are good to about 1e-4 of them
@@ -34,4 +44,5 @@ class RigConfig(Checked):
     depth_range_mm: Positive = (
         52.0  # in which the cameras see sharp: heights matter there, and proposed boards stay in it
     )
+    correlated_odds: PositiveOrInfinite = 50.0
     held_out: bool = True  # whether each board is also predicted by the rig of the others; with three boards or more

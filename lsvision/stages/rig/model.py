@@ -14,7 +14,7 @@ from torch import Tensor
 
 from lsvision.estimation import BorderedState
 from lsvision.geometry import RawPair, fit_rigid, quantities_of, rotation_from_vector, transform
-from lsvision.stages.rig.config import RigConfig
+from lsvision.stages.rig.config import RigSigmas
 from lsvision.stages.rig.sightings import Sightings
 from lsvision.types import RIG_QUANTITIES, Pose, RawRig
 
@@ -44,32 +44,39 @@ class RigPrior:
     sigma: Float[Tensor, " shared"]
 
     @classmethod
-    def of(cls, rig: RawRig, config: RigConfig) -> "RigPrior":
-        """A rig with the sigmas that its file states, and those of the options where it states none."""
+    def of(cls, rig: RawRig, usual: RigSigmas) -> "RigPrior":
+        """A rig with the sigmas that its file states, and the usual ones where it states none."""
         mean, stated = quantities_of(rig), dict(rig.sigma)
-        usual = {
-            "focal_length_mm": config.focal_length_share,
-            "principal_point_px": config.principal_sigma_px,
-            "distortion.0": config.distortion_sigma,
-            "distortion.1": config.distortion_sigma,
-            "turn_deg": config.turn_sigma_deg,
-            "baseline_mm": config.baseline_share,
-            "view_plane.offset_mm": config.plane_sigma_mm,
-            "view_plane.slope_x": config.plane_slope_sigma,
-            "view_plane.slope_z": config.plane_slope_sigma,
+        otherwise = {
+            "focal_length_mm": usual.focal_length_share,
+            "principal_point_px": usual.principal_sigma_px,
+            "distortion.0": usual.distortion_sigma,
+            "distortion.1": usual.distortion_sigma,
+            "turn_deg": usual.turn_sigma_deg,
+            "baseline_mm": usual.baseline_share,
+            "view_plane.offset_mm": usual.plane_sigma_mm,
+            "view_plane.slope_x": usual.plane_slope_sigma,
+            "view_plane.slope_z": usual.plane_slope_sigma,
         }
         relative = ("focal_length_mm", "baseline_mm")
         sigma = []
         for name, value in zip(RIG_QUANTITIES, mean.tolist(), strict=True):
             short = name.removeprefix("left.").removeprefix("right.")
-            sigma.append(stated.get(name, usual[short] * (value if short in relative else 1.0)))
-        return cls(rig, mean.new_tensor([*sigma, *[config.motion_sigma] * 3]))
+            sigma.append(stated.get(name, otherwise[short] * (value if short in relative else 1.0)))
+        return cls(rig, mean.new_tensor([*sigma, *[usual.motion_sigma] * 3]))
+
+    def state(self, shared: Shared) -> Float[Tensor, "*batch shared"]:
+        """Sigmas off the mean."""
+        return (shared.vector - self._mean) / self.sigma
 
     def shared(self, state: Float[Tensor, "*batch shared"]) -> Shared:
         """The rig's quantities and n, from sigmas off the mean."""
-        mean = torch.cat([quantities_of(self.rig), self.sigma.new_tensor([0.0, 1.0, 0.0])])
-        quantities, n = (mean + self.sigma * state).split([QUANTITIES, 3], dim=-1)
+        quantities, n = (self._mean + self.sigma * state).split([QUANTITIES, 3], dim=-1)
         return Shared(quantities, n)
+
+    @property
+    def _mean(self) -> Float[Tensor, " shared"]:
+        return torch.cat([quantities_of(self.rig), self.sigma.new_tensor([0.0, 1.0, 0.0])])
 
 
 @dataclass(frozen=True)
@@ -107,13 +114,17 @@ class RigModel:
         at_middle = seen - torch.stack([torch.zeros_like(middle), middle, torch.zeros_like(middle)], -1)[..., None, :]
         return cls(prior, fit_rigid(body, at_middle, sightings.valid), middle, body)
 
+    def placed(self, state: BorderedState) -> Float[Tensor, "*batch boards corners 3"]:
+        """Where the corners are before line 0, mm."""
+        n, poses = self.prior.shared(state.shared).n, state.own
+        rotation = rotation_from_vector(poses[..., :3]) @ self.start.rotation
+        moved = self.start.translation + poses[..., 3:] + self.middle_mm[..., None] * n[..., None, :]
+        return transform(rotation, moved, self.body_points)
+
     def predict(self, state: BorderedState) -> Predicted:
         """Where both cameras see the corners."""
-        shared, poses = self.prior.shared(state.shared), state.own
+        shared, points = self.prior.shared(state.shared), self.placed(state)
         pair = RawPair.of(self.prior.rig, shared.quantities[..., None, None, :])
         n = shared.n[..., None, None, :]
-        rotation = rotation_from_vector(poses[..., :3]) @ self.start.rotation
-        moved = self.start.translation + poses[..., 3:] + self.middle_mm[..., None] * n[..., 0, :]
-        points = transform(rotation, moved, self.body_points)
         left, right = pair.seen_left(points, n), pair.seen_right(points, n)
         return Predicted(*(torch.stack([seen.column, seen.travel], dim=-1) for seen in (left, right)))

@@ -4,10 +4,13 @@ from pathlib import Path
 
 import fsspec
 import pytest
+import torch
 
 from lsvision.archive import find_scans, local_archive
 from lsvision.errors import ConfigError
-from lsvision.io import read_scan
+from lsvision.io import read_scan, write_response
+from lsvision.types import CameraResponse
+from tests.archive.archives import WIDTH
 
 
 def touch(root: Path, *names: str) -> None:
@@ -92,6 +95,20 @@ def test_scans_behind_a_url_are_copied_with_their_rigs(remote, tmp_path, url, ke
     assert [item.key for item in found] == keys
     for item in found:
         assert read_scan(item.path).lines > 0
+
+
+def test_responses_that_a_shared_rig_names_are_copied_too(remote, tmp_path):
+    values = torch.ones(WIDTH, 3)
+    write_response(CameraResponse(0 * values, values), tmp_path / "r.tif")
+    remote.put(str(tmp_path / "r.tif"), "/bucket/r.tif")
+    rig = remote.cat_file("/bucket/rig.yaml")
+    remote.pipe_file("/bucket/rig.yaml", rig + b"response: {left: r.tif}\n")
+    found = find_scans(local_archive("memory://bucket/?", tmp_path / "copies"))
+    assert [item.problem for item in found] == [None, None]
+    assert read_scan(found[0].path).lines > 0
+    remote.pipe_file("/bucket/rig.yaml", rig + b"response: {left: ../../r.tif}\n")
+    found = find_scans(local_archive("memory://bucket/?", tmp_path / "copies"))
+    assert {item.problem for item in found} == {"rig.yaml: response: leads outside the archive"}
 
 
 def test_unchanged_files_of_a_url_are_not_copied_again(remote, tmp_path):

@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-import math
 from functools import cache
 from pathlib import Path
 
@@ -23,21 +22,15 @@ from lsvision.stages.disparity.config import DisparityConfig
 from lsvision.stages.disparity.depth import depth_of, relation_of_scan
 from lsvision.stages.disparity.rectify import RectifiedPair
 from lsvision.types import Pose, RawCamera, RawRig, Scan, StereoPair, TensorImage, Travel, ViewPlane
+from tests.raw_cameras import RAW
 from tests.stages.other_renderer import raw_scan
 from tests.stages.rendered import BOARD, MOTION, simulation, stereo_scan
 
-TILT = math.radians(0.2)
-FULL_RAW = RawRig(
-    7142, 10.0, 354.0,
-    RawCamera(114.1, 3571.0, 0.2212, (0.012, -0.01)),
-    RawCamera(113.6, 3569.6, -0.2203, (-0.009, 0.006)),
-    ViewPlane(0.25, TILT, -TILT),
-)  # fmt: skip
 SCALE = 8
 SHEET = SceneConfig("sheet", pitch_deg=2.0, roll_deg=1.5, margin_mm=5.0, sheet_height_mm=80.0, texture_mm=0.8)
 
 
-def rendered(raw: RawRig = FULL_RAW, motion: MotionConfig = MOTION, **acquisition) -> tuple[Simulation, Scan]:
+def rendered(raw: RawRig = RAW, motion: MotionConfig = MOTION, **acquisition) -> tuple[Simulation, Scan]:
     """A sheet under raw cameras."""
     source = simulate(
         scaled_raw_rig(raw, SCALE), BOARD, SHEET, motion, SensorConfig(supersampling=2),
@@ -128,7 +121,7 @@ def test_uneven_travel_shears_by_what_the_encoder_says():
 
 
 def test_planes_that_are_one_leave_rows_alone():
-    raw = dataclasses.replace(scaled_raw_rig(FULL_RAW, SCALE), view_plane=ViewPlane())
+    raw = dataclasses.replace(scaled_raw_rig(RAW, SCALE), view_plane=ViewPlane())
     scan = dataclasses.replace(sheet()[1], raw_rig=raw)
     pair = RectifiedPair.of(scan, DisparityConfig())
     assert pair is not None

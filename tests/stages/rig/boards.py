@@ -10,7 +10,7 @@ from lsvision.geometry import quantities_of
 from lsvision.stages.rig.config import RigConfig
 from lsvision.stages.rig.model import RigPrior, Shared
 from lsvision.stages.rig.sightings import CameraSighting, Sightings
-from lsvision.study.rig_scans import RigConditions, scanned
+from lsvision.study.rig_scans import RigConditions, board_poses, scanned
 from lsvision.types import Board, RawCamera, RawRig
 
 TURN = math.radians(12.522717)
@@ -47,7 +47,8 @@ class Truth:
         conditions = replace(usual, column_sigma_px=noise * usual.column_sigma_px, line_sigma=noise * usual.line_sigma)
         n = self.n[:, None] if n is None else n
         truth = Shared(self.quantities[:, None].expand(-1, n.shape[1], -1), n)
-        return restated(scanned(PRIOR, truth, BOARD, conditions), 1 / noise)
+        poses = board_poses(DATA_SHEET, BOARD, conditions, len(n))
+        return restated(scanned(DATA_SHEET, truth, poses, BOARD, conditions), 1 / noise)
 
 
 def restated(sightings: Sightings, ratio: float) -> Sightings:

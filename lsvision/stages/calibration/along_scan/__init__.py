@@ -10,7 +10,7 @@ from lsvision.stages.calibration.along_scan.edges import EdgeRows, edge_rows
 from lsvision.stages.calibration.along_scan.errors import ErrorsAlongScan, errors_along_scan, with_processes
 from lsvision.stages.calibration.along_scan.evidence import Linearised
 from lsvision.stages.calibration.along_scan.kernels import FINE, SEARCHED
-from lsvision.stages.calibration.along_scan.lines import COMPONENTS, latents
+from lsvision.stages.calibration.along_scan.lines import COMPONENTS, Travel, latents
 from lsvision.stages.calibration.along_scan.posterior import Processes, processes_given_corners
 from lsvision.stages.calibration.along_scan.search import Beforehand, FoundErrors, search
 from lsvision.stages.calibration.along_scan.spectrum import Spectrum
@@ -27,6 +27,7 @@ __all__ = [
     "Linearised",
     "Processes",
     "Spectrum",
+    "Travel",
     "by_chance",
     "edge_rows",
     "errors_along_scan",

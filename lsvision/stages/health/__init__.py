@@ -1,0 +1,1 @@
+"""Scans of an archive -> signals of drift that need no target."""

@@ -1,0 +1,1 @@
+"""Scans -> the response of the cameras' columns: offset and gain."""
