@@ -13,13 +13,15 @@ import torch
 
 from lsvision.archive.depth_store import open_depth_store
 from lsvision.archive.identity import ScanFiles
-from lsvision.archive.line_motion import measured_travel
+from lsvision.archive.line_motion import DepthAlone
 from lsvision.archive.opened import open_depth, open_relation, open_scan, planned_files
 from lsvision.image.tiling import one_torch_thread
 from lsvision.io.formats.validation import on_one_line
 from lsvision.stages.disparity.config import DisparityConfig
 from lsvision.stages.health.direction import NOT_SEEN, Direction, measure_direction
+from lsvision.stages.line_motion.color_travel import ColorTravel
 from lsvision.stages.line_motion.config import LineMotionConfig
+from lsvision.stages.line_motion.measure import measure_travel
 from lsvision.types import DepthSource, Motion, Scan
 
 log = logging.getLogger(__name__)
@@ -62,7 +64,7 @@ class MeasureHealth:
             n = torch.tensor(self.n, dtype=torch.float64)
             motion, config = Motion(n, n.diag() * 0), LineMotionConfig()
             direction = _direction(scan, depth, motion, config)
-            travel = measured_travel(scan, depth, motion, config)
+            travel = _travel(scan, depth, motion, config)
             relation = open_relation(self.scan, self.disparity)
         known = {name: _or_none(value) for name, value in _columns_of(direction).items()}
         if travel is not None and travel.is_measured:
@@ -84,6 +86,15 @@ def _direction(scan: Scan, depth: DepthSource, motion: Motion, config: LineMotio
     except (ValueError, torch.linalg.LinAlgError) as error:  # an object of next to no samples
         log.warning("%s: no direction can be measured: %s", scan.path, on_one_line(error))
         return NOT_SEEN
+
+
+def _travel(scan: Scan, depth: DepthSource, motion: Motion, config: LineMotionConfig) -> ColorTravel | None:
+    """The advance by the lines of the colours; None where nothing shows it."""
+    try:
+        return measure_travel(scan, DepthAlone(depth), motion, config)
+    except (ValueError, torch.linalg.LinAlgError) as error:
+        log.warning("%s: no travel can be measured: %s", scan.path, on_one_line(error))
+        return None
 
 
 def _columns_of(direction: Direction) -> dict[str, float]:

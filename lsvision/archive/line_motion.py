@@ -15,15 +15,14 @@ from lsvision.archive.opened import open_depth, open_scan, planned_files
 from lsvision.errors import FileFormatError, LsvisionError
 from lsvision.geometry import travel_at
 from lsvision.image.tiling import one_torch_thread
-from lsvision.io import naming_full_disk, read_line_motion, write_line_motion
+from lsvision.io import naming_full_disk, read_line_motion, read_section, write_line_motion
 from lsvision.io.formats.validation import on_one_line, read_bytes
 from lsvision.stages.disparity.config import DisparityConfig
-from lsvision.stages.line_motion.color_travel import ColorTravel
 from lsvision.stages.line_motion.config import LineMotionConfig
 from lsvision.stages.line_motion.estimate import not_measured
-from lsvision.stages.line_motion.measure import measure_line_motion, measure_travel
+from lsvision.stages.line_motion.measure import LineMeasurement, measure_line_motion
 from lsvision.stages.line_spectrum import band_of_power
-from lsvision.types import Depth, DepthSource, LineMotion, Motion, Scan, Travel
+from lsvision.types import Depth, DepthSource, LineMotion, Motion, Scan, Section, Travel
 
 log = logging.getLogger(__name__)
 
@@ -35,29 +34,34 @@ class LineMotionChoice:
     """Where the motion from line to line of scans comes from.
 
     ``source`` is ``none``; ``auto``, which is a scan's own log where it has one, and its profile, measured with
-    ``config``, where it has none; or the path of a file with the hash ``sha256``.
+    ``config`` and the ``section`` that it names, where it has none; or the path of a file with the hash ``sha256``.
     """
 
     source: str = "none"
     sha256: str = ""
     config: LineMotionConfig = field(default_factory=LineMotionConfig)
+    section: Section | None = None
 
     @classmethod
     def of(cls, source: str, config: LineMotionConfig) -> "LineMotionChoice":
         """The choice of an option.
 
         Raises:
-            FileFormatError: ``source`` is a file that cannot be read.
+            FileFormatError: ``source``, or the section, is a file that cannot be read.
         """
+        section = section_of(config)
         if source in ("auto", "none"):
-            return cls(source, config=config)
+            return cls(source, config=config, section=section)
         path = Path(source).absolute()
         return cls(str(path), hashlib.sha256(read_bytes(path)).hexdigest(), config)
 
     @property
     def key(self) -> str:
         """Hash of everything that it says but the name of a file."""
-        return key_of(self.sha256 or self.source, asdict(self.config) if self.source == "auto" else None)
+        if self.source != "auto":
+            return key_of(self.sha256 or self.source, None)
+        section = "scan" if self.section is None else asdict(self.section)
+        return key_of(self.source, asdict(self.config) | {"reference": section})
 
     def origin(self, logged: bool) -> Origin:
         """Where the motion of a scan with a log, or without, comes from."""
@@ -111,30 +115,34 @@ class FindLineMotion:
             return scan.line_motion
         depth = open_depth_store(self.depth_store) if self.depth_store else open_depth(self.scan, self.disparity)
         n = torch.tensor(self.n, dtype=torch.float64)
-        return measured_line_motion(scan, depth, Motion(n, n.diag() * 0), self.choice.config)
+        return measured_line_motion(
+            scan, depth, Motion(n, n.diag() * 0), self.choice.config, self.choice.section
+        ).motion
 
 
-def measured_line_motion(scan: Scan, depth: DepthSource, motion: Motion, config: LineMotionConfig) -> LineMotion:
+def section_of(config: LineMotionConfig) -> Section | None:
+    """The nominal section that options name; None for the scan's own profile.
+
+    Raises:
+        FileFormatError: it is a file that cannot be read.
+    """
+    return None if config.reference == "scan" else read_section(config.reference)
+
+
+def measured_line_motion(
+    scan: Scan, depth: DepthSource, motion: Motion, config: LineMotionConfig, section: Section | None = None
+) -> LineMeasurement:
     """Measure the motion of a scan on its profile, on one thread: the bits are the same wherever it runs.
 
     What cannot be measured is no error: the findings say why.
     """
     with one_torch_thread():
         try:
-            return measure_line_motion(scan, DepthAlone(depth), motion, config)
+            return measure_line_motion(scan, DepthAlone(depth), motion, config, section)
         except (ValueError, torch.linalg.LinAlgError) as error:  # an object of next to no samples
             log.warning("%s: no line motion can be measured: %s", scan.path, on_one_line(error))
-            return not_measured(scan.lines, "the scan shows no profile that lines can be registered to")
-
-
-def measured_travel(scan: Scan, depth: DepthSource, motion: Motion, config: LineMotionConfig) -> ColorTravel | None:
-    """The advance of a scan by the lines of its colours, on one thread; None where nothing shows it."""
-    with one_torch_thread():
-        try:
-            return measure_travel(scan, DepthAlone(depth), motion, config)
-        except (ValueError, torch.linalg.LinAlgError) as error:
-            log.warning("%s: no travel can be measured: %s", scan.path, on_one_line(error))
-            return None
+            reason = "the scan shows no profile that lines can be registered to"
+            return LineMeasurement(not_measured(scan.lines, reason))
 
 
 @dataclass(frozen=True)
@@ -194,7 +202,7 @@ def _version(path: Path | str) -> tuple[int, int] | None:
 
 def line_motion_metadata(motion: LineMotion, origin: Origin, travel: Travel) -> dict[str, Any]:
     """What is known about a motion, as plain data: its source, its components, and what may be shape instead."""
-    lines = torch.arange(motion.lines, dtype=torch.float64)
+    lines, section = torch.arange(motion.lines, dtype=torch.float64), motion.section
     advance = float(travel_at(travel, lines).diff().abs().mean())
     band = ambiguous_band(motion, advance) if origin == "measured" else None
     return {
@@ -204,6 +212,7 @@ def line_motion_metadata(motion: LineMotion, origin: Origin, travel: Travel) -> 
         "components": [{**asdict(finding), "in_words": finding.in_words} for finding in motion.findings],
         "ambiguous_wavelengths_mm": list(band) if band else None,
         "note": ambiguity_in_words(band) if band else "",
+        "section": None if section is None else {**asdict(section), "in_words": section.in_words},
     }
 
 

@@ -14,6 +14,7 @@ from lsvision.io import ProductLayout, check_product, read_product, read_scan
 from lsvision.io.atomic import check_replaceable
 from lsvision.io.inside import path_inside
 from lsvision.io.product.layout import ROOT_METADATA
+from lsvision.stages.correction.correct import rig_errors_of
 from lsvision.stages.correction.grid import source_dtype
 from lsvision.stages.correction.uncertainty import EncoderRepair, drift_per_metre
 from lsvision.stages.disparity.depth import relation_of_scan
@@ -63,6 +64,7 @@ def product_layout(
     repair = EncoderRepair.of(scan.travel)
     calibration = planned.calibration.calibration
     motion = calibration.motion
+    by_rig = rig_errors_of(scan, motion, planned.correction)
     sideways, in_depth = motion.drift_mm_per_m
     return ProductLayout(
         grid=planned.grid,
@@ -86,6 +88,7 @@ def product_layout(
             "disparity": asdict(processing.disparity),
             **({"pair": relation.metadata} if relation is not None else {}),
             **({"encoder_repair": asdict(repair)} if repair is not None else {}),
+            **({"rig_sigma": by_rig.metadata} if by_rig is not None else {}),
             **({"missing_lines": _missing_in(scan)} if scan.missing else {}),
             "line_motion": {"source": "none"} if found is None else found.metadata(scan.travel),
             "correction": asdict(planned.correction),

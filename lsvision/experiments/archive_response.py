@@ -83,7 +83,7 @@ def _gains(
     motion = calibration_for(scan, calibrations).calibration.motion
     matching = DisparityConfig()
     with stored_depth(scan, depth_of(scan, matching, n=motion.n), matching, folder) as depth:
-        moved = measured_line_motion(scan, depth, motion, LineMotionConfig())
+        moved = measured_line_motion(scan, depth, motion, LineMotionConfig()).motion
         sideways = next(finding for finding in moved.findings if finding.component == "dx")
         if sideways.state not in ("corrected", "absent"):
             raise ResponseError(f"{found.path}: {sideways.in_words}")

@@ -79,7 +79,8 @@ def run_calibrate(settings: CalibrateSettings, folder: Path) -> None:
     )
     target = Path(settings.output) if settings.output else folder / "calibration.json"
     guide = alignment(calibration, scans, settings.calibration.prior_sigma, settings.installation)
-    calibration = write_line_motions(replace(calibration, provenance=provenance, installation=guide), target)
+    calibration = replace(calibration, provenance=provenance, installation=guide, raw_rig=scans[0].raw_rig)
+    calibration = write_line_motions(calibration, target)
     write_calibration(calibration, target)
     write_json(folder / "summary.json", _summary(calibration))
     calibration_report(calibration, boards, asdict(settings), folder)

@@ -66,6 +66,8 @@ class ProductSummary:
     which whole ones were taken into account, its gain, offset and curve; None where the camera measured the depth.
     ``encoder_repair`` has the number of lines whose travel was interpolated and the largest standard deviation of their
     travel, mm; None where none was.
+    ``rig_sigma`` is by how much heights may be off as a raw rig is not known exactly, on every line alike: the bend in
+    um, the shift in mm and the tilt in deg of all of them; None where the rig counts as exact.
     ``missing_lines`` counts the lines of the scan that were not there. ``line_motion`` has the source of the motion
     from line to line, its components with rms, sigma and reason, and the wavelengths that may be shape.
     """
@@ -82,6 +84,7 @@ class ProductSummary:
     drift_mm_per_m: tuple[float, ...]
     pair: dict[str, Any] | None
     encoder_repair: dict[str, Any] | None
+    rig_sigma: dict[str, Any] | None
     missing_lines: int
     line_motion: dict[str, Any]
 
@@ -119,6 +122,12 @@ def run_correct(settings: CorrectSettings, folder: Path) -> None:
         log.info("%s", line)
     if summary.pair is not None:
         log.info("%s", _pair_in_words(summary.pair))
+    if summary.rig_sigma is not None:
+        log.info(
+            "by what is not known of the rig, on every line alike: heights bent by %.2g um rms, all shifted by %.2g mm "
+            "and tilted by %.2g deg",
+            *(summary.rig_sigma[name] for name in ("bend_sigma_um", "shift_sigma_mm", "tilt_sigma_deg")),
+        )
     if summary.encoder_repair is not None:
         log.info(
             "encoder log repaired: travel of %d lines interpolated, known to %.2g mm at worst",
@@ -175,6 +184,7 @@ def make_product(planned: PlannedScan, processing: Processing, output: Path, bar
         drift_mm_per_m=drift_per_metre(planned.calibration.calibration.motion),
         pair=_entry(metadata, "pair"),
         encoder_repair=_entry(metadata, "encoder_repair"),
+        rig_sigma=_entry(metadata, "rig_sigma"),
         missing_lines=planned.missing_lines,
         line_motion=_entry(metadata, "line_motion") or {},
     )

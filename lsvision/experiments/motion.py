@@ -7,7 +7,7 @@ from pathlib import Path
 import torch
 
 from lsvision.archive import calibration_for, measured_line_motion, read_calibrations
-from lsvision.archive.line_motion import line_motion_metadata, measured_travel
+from lsvision.archive.line_motion import line_motion_metadata, section_of
 from lsvision.experiments.settings import RunSettings
 from lsvision.experiments.stored_depth import stored_depth
 from lsvision.geometry import ProductFrame, object_pitch_mm
@@ -42,6 +42,7 @@ class MotionSettings(RunSettings):
 
 def run_motion(settings: MotionSettings, folder: Path) -> None:
     """Measure the motion; write ``line_motion.parquet``, ``summary.json`` and the report."""
+    section = section_of(settings.registration)
     scan = read_scan(settings.scan, repair_encoder=settings.repair_encoder, missing_lines=settings.missing_lines)
     dated = calibration_for(scan, read_calibrations(settings.calibration, settings.accept))
     if dated.warning:
@@ -49,8 +50,8 @@ def run_motion(settings: MotionSettings, folder: Path) -> None:
     keep_freed_memory()
     matched = depth_of(scan, settings.disparity, n=dated.calibration.motion.n)
     with stored_depth(scan, matched, settings.disparity, folder) as depth:
-        motion = measured_line_motion(scan, depth, dated.calibration.motion, settings.registration)
-        travel = measured_travel(scan, depth, dated.calibration.motion, settings.registration)
+        measured = measured_line_motion(scan, depth, dated.calibration.motion, settings.registration, section)
+        motion, travel = measured.motion, measured.travel
         still = ProductFrame(scan.rig, scan.travel, dated.calibration.motion.n)
         steadied = ProductFrame(scan.rig, scan.travel, still.n, None if motion.is_still else motion)
         lines = _spread_lines(scan.lines)

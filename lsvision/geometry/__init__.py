@@ -46,6 +46,7 @@ from lsvision.geometry.product_axes import (
 )
 from lsvision.geometry.raw_pair import LineCamera, Met, RawPair, Seen, quantities_of, with_quantities
 from lsvision.geometry.rectification import Rectification, RowShear
+from lsvision.geometry.rig_errors import rig_covariance, rig_modes, with_covariance
 from lsvision.geometry.rigid import (
     euler_angles,
     fit_rigid,
@@ -95,6 +96,8 @@ __all__ = [
     "project",
     "quantities_of",
     "registered_rows",
+    "rig_covariance",
+    "rig_modes",
     "rotation_from_vector",
     "scaled_raw_rig",
     "scaled_rig",
@@ -113,6 +116,7 @@ __all__ = [
     "triangulation_jacobian",
     "uneven_travel",
     "vector_from_rotation",
+    "with_covariance",
     "with_quantities",
     "without_trend",
     "zero_disparity_mm",

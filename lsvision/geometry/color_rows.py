@@ -1,8 +1,8 @@
 """In which rows of an image the colours of a trilinear sensor show the same piece of the object.
 
-Red, green and blue look at different planes Y = s. The depth of a scan is that of its green lines; another colour sees
-the same point s / n2 of travel later (``ProductFrame.shifted_line``), and some cameras shift the rows of each colour by
-whole lines to make up for it.
+Red, green and blue look at different planes Y = s z / z0. The depth of a scan is that of its green lines; another
+colour sees the same point Y / n2 of travel later (``ProductFrame.plane_y``, ``shifted_line``), and some cameras shift
+the rows of each colour by whole lines to make up for it.
 """
 
 import torch

@@ -6,6 +6,7 @@ from dataclasses import replace
 import torch
 
 from lsvision.geometry.raw_pair import RawPair
+from lsvision.geometry.rig_errors import in_larger_pixels
 from lsvision.types import RawRig, Rig, ViewPlane
 
 _DIGITS = 6  # of px and mm: the ideal pair is a convention, and so is the same on every machine
@@ -61,7 +62,7 @@ def scaled_raw_rig(raw: RawRig, scale: float | int) -> RawRig:
     )
     red, green, blue = raw.color_spacing_lines
     scaled = replace(
-        raw,
+        in_larger_pixels(raw, scale),
         width_px=math.ceil(raw.width_px / scale),
         pixel_pitch_um=raw.pixel_pitch_um * scale,
         left=left,

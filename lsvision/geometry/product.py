@@ -162,22 +162,30 @@ class ProductFrame:
         x = slope * z[:, None]
         return to_product(torch.stack([x, torch.zeros_like(x), z[:, None].expand_as(x)], dim=-1), self.n)
 
+    def plane_y(self, shift_mm: Float[Tensor, "*#batch"], z: Float[Tensor, "*#batch"]) -> Float[Tensor, "*batch"]:
+        """Y, mm, at which a sensor line that looks at Y = shift at z0 sees a point that the scan plane shows at z, mm.
+
+        Its plane goes through the cameras' centres, Y = shift z / z0: the further away, the further apart the lines
+        look. Until it sees the point, the object has moved in depth by Y n3 / n2.
+        """
+        return shift_mm * z / (zero_disparity_mm(self.rig) - shift_mm * self.n[2] / self.n[1])
+
     def shifted_column(
         self,
         column: Float[Tensor, "*batch"],
-        relief: Float[Tensor, "*batch"],
-        shift_mm: Float[Tensor, ""],
+        z: Float[Tensor, "*batch"],
+        shift_mm: Float[Tensor, "*#batch"],
         lines: tuple[Tensor, Tensor] | None = None,
     ) -> Float[Tensor, "*batch"]:
-        """Column in which a sensor line that looks at the plane Y = shift sees what the scan plane shows in another.
+        """Column in which a sensor line sees at Y = shift what the scan plane shows in another column at depth z, mm.
 
         The point is seen when the object has moved on by shift / n2 of travel, displaced by shift (n1, n3) / n2.
 
         Args:
+            shift_mm: ``plane_y`` of the point.
             lines: the (fractional) line that shows the point in ``column``, and the one on which the sensor line sees
                 it, ``shifted_line``; None without line motion.
         """
-        z = self.depth(column, relief, None if lines is None else lines[0])
         moved_x, moved_z = shift_mm * self.n[0] / self.n[1], shift_mm * self.n[2] / self.n[1]
         if self.line_motion is None or lines is None:
             x_px = (column - self.rig.principal_left_px) * z + focal_length_px(self.rig) * moved_x
@@ -190,7 +198,7 @@ class ProductFrame:
     def shifted_line(
         self, line: Float[Tensor, "*#batch"], shift_mm: Float[Tensor, "*#batch"]
     ) -> Float[Tensor, "*batch"]:
-        """Line on which a sensor line that looks at the plane Y = shift sees what the scan plane shows on another."""
+        """Line on which a sensor line sees at Y = shift, its ``plane_y``, what the scan plane shows on another line."""
         return line_at(self.true_travel, travel_at(self.true_travel, line) - shift_mm / self.n[1])
 
     def displacement_jacobian(

@@ -25,6 +25,8 @@ _GROUP = 16  # neighbouring columns, by which the variation of one of them is ju
 # columns on both sides vary: at the edge of a dark area the range changes from column to column.
 _STUCK, _LIVELY, _LEAST_RANGE = 0.1, 0.5, 3.0
 _WILD, _LEAST_DIFFERENCE = 8.0, 0.02  # times the usual difference from a neighbour; of white
+# Share of the lines on which a column is above or below those on both sides of it: 2/3 where all is noise.
+_STANDS_OUT = 0.5
 
 
 @dataclass(frozen=True)
@@ -127,7 +129,8 @@ def _top_codes(dtype: torch.dtype, highest: int) -> tuple[int, ...]:
 def _faulty_columns(sampled: Float[Tensor, "lines width channels"], white: float) -> Bool[Tensor, " width"]:
     """Columns that do not vary along the scan although their neighbours do, or differ from both of them far more.
 
-    The median over the sampled lines is what counts: an edge of the object that crosses a column is no fault.
+    The median over the sampled lines is what counts: an edge of the object that crosses a column is no fault. Nor is
+    one that runs along a column: what lies on an edge is between the columns on both sides of it.
     """
     values = gray(sampled)
     ranges = values.amax(0) - values.amin(0)
@@ -136,7 +139,19 @@ def _faulty_columns(sampled: Float[Tensor, "lines width channels"], white: float
     steps = F.pad(_median_of_lines(values.diff(dim=1).abs()), (1, 1), value=torch.inf)
     difference = torch.minimum(steps[:-1], steps[1:])  # from the nearer neighbour
     wild = (difference > _WILD * _usual(difference, around=True)) & (difference > _LEAST_DIFFERENCE * white)
-    return stuck | wild
+    return _standing_out(values, stuck | wild)
+
+
+def _standing_out(values: Float[Tensor, "lines columns"], odd: Bool[Tensor, " columns"]) -> Bool[Tensor, " columns"]:
+    """The odd columns that do not lie between the nearest others on their left and on their right, as an edge does."""
+    columns, others = odd.nonzero()[:, 0], (~odd).nonzero()[:, 0]
+    after = torch.searchsorted(others, columns)
+    inside = (after > 0) & (after < len(others))
+    columns, after = columns[inside], after[inside]
+    own, left, right = values[:, columns], values[:, others[after - 1]], values[:, others[after]]
+    kept = odd.clone()
+    kept[columns] = ((own - left) * (own - right) > 0).float().mean(0) > _STANDS_OUT
+    return kept
 
 
 def _median_of_lines(values: Float[Tensor, "lines columns"]) -> Float[Tensor, " columns"]:

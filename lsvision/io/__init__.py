@@ -16,9 +16,10 @@ from lsvision.io.formats.raw_rig import (
 from lsvision.io.formats.response import read_response, write_response, write_rig_with_response
 from lsvision.io.formats.rig import read_rig, rig_from_dict, rig_to_dict, write_rig
 from lsvision.io.formats.rig_calibration import write_rig_calibration
-from lsvision.io.formats.rig_match import check_rig_match
+from lsvision.io.formats.rig_match import check_rig_match, rig_difference
 from lsvision.io.formats.scan import NewScan, read_scan, write_scan
 from lsvision.io.formats.scan_files import rig_file, scan_files
+from lsvision.io.formats.section import read_section
 from lsvision.io.images.line_image import open_line_image
 from lsvision.io.images.tiff import write_line_image
 from lsvision.io.json_file import finite_or_null, write_json
@@ -62,7 +63,9 @@ __all__ = [
     "read_rig",
     "read_rig_pair",
     "read_scan",
+    "read_section",
     "remove_partial_siblings",
+    "rig_difference",
     "rig_file",
     "rig_from_dict",
     "rig_to_dict",

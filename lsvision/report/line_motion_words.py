@@ -12,7 +12,7 @@ _ORIGINS = {
 
 
 def line_motion_words(metadata: Mapping[str, Any]) -> Iterator[str]:
-    """One line on where it came from, one on each component, and one on what may be shape instead.
+    """One line on where it came from, one on each component, and on the section and what may be shape instead.
 
     Args:
         metadata: the entry ``line_motion`` of a product's metadata.
@@ -21,5 +21,7 @@ def line_motion_words(metadata: Mapping[str, Any]) -> Iterator[str]:
     yield f"motion from line to line: {_ORIGINS.get(source, source)}"
     for component in metadata.get("components", ()):
         yield f"  {component['in_words']}"
+    if metadata.get("section"):
+        yield f"  {metadata['section']['in_words']}"
     if metadata.get("note"):
         yield f"  {metadata['note']}"

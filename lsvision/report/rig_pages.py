@@ -24,6 +24,7 @@ def rig_summary(calibration: RigCalibration) -> str:
         f"  stretch      {calibration.motion.stretch:.6f}",
         f"  drift        {drift_in_words(calibration.motion)}",
     ]
+    lines += [f"  allowed for  {error.in_words}" for error in calibration.errors_along_scan]
     lines += [f"  because      {reason}" for reason in calibration.reasons if reason != calibration.advice]
     lines += [
         f"  not measured {item.in_words}: sigma stays at {item.share:.2f} of the data sheet's"

@@ -169,7 +169,8 @@ def cast_rays(trajectory: Trajectory, camera: Camera, columns: Tensor, lines: Te
         trajectory: the true motion.
         camera: "left" or "right".
         columns, lines: positions, px and lines.
-        plane_y_mm: Y of the plane that the sensor line sees; zero except for a trilinear sensor.
+        plane_y_mm: Y, at the depth of zero disparity, of the plane through the camera's centre that the sensor line
+            sees; zero except for a trilinear sensor.
     """
     rig, raw = trajectory.rig, trajectory.raw
     camera_x = camera_center_mm(rig, camera)
@@ -187,7 +188,8 @@ def cast_rays(trajectory: Trajectory, camera: Camera, columns: Tensor, lines: Te
     pivot = trajectory.pivot
     from_pivot_x, from_pivot_z = camera_x - pivot[0] - dx, -pivot[2] - dz
     origin = across * from_pivot_x[:, None] + depth * from_pivot_z[:, None] + pivot
-    origin = origin + origin.new_tensor([0.0, plane_y_mm, 0.0]) + trajectory.position(lines)[:, None] * trajectory.n
+    origin = origin + trajectory.position(lines)[:, None] * trajectory.n
+    depth = depth + depth.new_tensor([0.0, plane_y_mm / float(pivot[2]), 0.0])
     if raw is not None and camera == "right":
         # Along a ray, Y of its plane is linear in z and in the slope.
         up, none = origin.new_tensor([0.0, 1.0, 0.0]), origin.new_zeros(())

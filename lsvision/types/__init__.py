@@ -47,6 +47,7 @@ from lsvision.types.scan import (
     Travel,
     missing_ranges,
 )
+from lsvision.types.section import Section, SectionFit
 
 __all__ = [
     "LINE_COMPONENTS",
@@ -89,6 +90,8 @@ __all__ = [
     "RigCombination",
     "RigVerdict",
     "Scan",
+    "Section",
+    "SectionFit",
     "StereoPair",
     "StoredDepth",
     "TensorImage",

@@ -10,6 +10,7 @@ from torch import Tensor
 from lsvision.schema import NonNegative, Positive
 from lsvision.types.installation import Installation
 from lsvision.types.line_motion import LineFinding, LineMotion
+from lsvision.types.raw_rig import RawRig
 from lsvision.types.scan import Rig
 
 CalibrationMethod = Literal["joint", "two_step", "sequential", "least_squares"]
@@ -36,7 +37,8 @@ class BoardCorners:
     ``points`` are the measured ``(x, travel, z)`` of every corner in the order of ``board_points``; ``covariance`` is
     theirs, mm². A corner with ``valid`` false was not seen; its point is NaN. ``left_px`` and ``right_px`` are where
     both images show them, (column, line); of a raw rig, the images of its ideal pair.
-    ``travel_mm`` is the travel of every line of the scan, where that is known.
+    ``travel_mm`` is the travel of every line of the scan, where that is known. ``by_rig`` is how far points are off,
+    mm, by each of the independent errors of a raw rig, of one sigma, which all its scans share.
     """
 
     scan: str
@@ -47,6 +49,7 @@ class BoardCorners:
     left_px: Float[Tensor, "corners 2"]
     right_px: Float[Tensor, "corners 2"] | None = None
     travel_mm: Float[Tensor, " lines"] | None = None
+    by_rig: Float[Tensor, "corners 3 modes"] | None = None
 
 
 @dataclass(frozen=True)
@@ -188,7 +191,8 @@ class Calibration:
     ``noise_scale`` is how many times larger than the corners' given covariance their residuals are, 1 where they are as
     expected; the covariance of n allows for it, and for the ``errors_along_scan`` that the residuals show.
     ``line_motions`` are these line by line, for every board's scan, and empty where they are not part of the result;
-    the RMSE after is then without them. ``installation`` is how to align the cameras; None where n is not usable.
+    the RMSE after is then without them. ``raw_rig`` are the cameras where they are raw, ``rig`` their ideal pair then.
+    ``installation`` is how to align the cameras; None where n is not usable.
     """
 
     method: CalibrationMethod
@@ -206,6 +210,7 @@ class Calibration:
     noise_scale: float = 1.0
     errors_along_scan: tuple[ErrorAlongScan, ...] = ()
     line_motions: tuple[LineMotion, ...] = ()
+    raw_rig: RawRig | None = None
     installation: Installation | None = None
     provenance: Provenance = field(default_factory=lambda: Provenance("", ""))
 

@@ -8,6 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lsvision.schema import NonNegative
+from lsvision.types.section import SectionFit
 
 LineComponent = Literal["dx", "dz", "roll", "dy"]
 LINE_COMPONENTS: tuple[LineComponent, ...] = ("dx", "dz", "roll", "dy")
@@ -70,11 +71,13 @@ class LineMotion:
         covariance: of what ``values`` err by, by line. A component that is not corrected, where others are, may be
             there: it errs by what is thought of it. All zero where nothing is corrected.
         findings: what is known about each component; empty where the motion was given from outside.
+        section: where the object's nominal section lies, which the lines were compared with; None where there is none.
     """
 
     values: Float[Tensor, "lines 4"]
     covariance: Float[Tensor, "lines 4 4"]
     findings: tuple[LineFinding, ...] = ()
+    section: SectionFit | None = None
 
     @property
     def lines(self) -> int:

@@ -45,7 +45,8 @@ class RawRig(Checked):
 
     The left one looks at the plane Y = 0, which is the scan plane; the right one at ``view_plane``.
     ``color_spacing_lines`` is as in ``Rig``. ``sigma`` are the standard deviations of its quantities, by their names in
-    the file, in the file's units; what is not named counts as exact.
+    the file, in the file's units; what is not named counts as exact. ``covariance`` is that of all ``RIG_QUANTITIES``,
+    as a calibration left it, and replaces ``sigma`` where it is there.
     """
 
     width_px: PositiveInt
@@ -56,3 +57,4 @@ class RawRig(Checked):
     view_plane: ViewPlane = field(default_factory=ViewPlane)
     color_spacing_lines: tuple[float, float, float] = (0.0, 0.0, 0.0)
     sigma: tuple[tuple[str, NonNegative], ...] = ()
+    covariance: tuple[tuple[float, ...], ...] | None = None

@@ -6,7 +6,7 @@ from typing import Literal
 from jaxtyping import Float
 from torch import Tensor
 
-from lsvision.types.calibration import Motion, Pose, Provenance
+from lsvision.types.calibration import ErrorAlongScan, Motion, Pose, Provenance
 from lsvision.types.installation import Installation
 from lsvision.types.raw_rig import RawRig
 
@@ -66,7 +66,8 @@ class RigCalibration:
     ``covariance`` is of ``RIG_QUANTITIES``, in the units of the rig's file, and of n after them. ``noise_scale`` is how
     many times larger than stated the corners' errors are. ``height_error_um`` is how far, rms, the heights of the
     field may be bent by what is not known of the rig. ``unobserved`` are the combinations that the prior says more of
-    than the scans. ``installation`` is how to align the cameras; None where n is not usable.
+    than the scans. ``errors_along_scan`` are those of whole lines that were allowed for. ``installation`` is how to
+    align the cameras; None where n is not usable.
     """
 
     rig: RawRig
@@ -80,6 +81,7 @@ class RigCalibration:
     advice: str
     verdict: RigVerdict
     reasons: tuple[str, ...] = ()
+    errors_along_scan: tuple[ErrorAlongScan, ...] = ()
     installation: Installation | None = None
     provenance: Provenance = field(default_factory=lambda: Provenance("", ""))
 

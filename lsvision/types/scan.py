@@ -22,8 +22,8 @@ MissingLines = Literal["refuse", "mark"]
 class Rig(Checked):
     """A rectified pair of line cameras: both sensors on one line, optical axes parallel (Eq. 2).
 
-    ``color_spacing_lines`` is where the red, green and blue sensor lines look along Y, in nominal lines, for a
-    trilinear sensor; (0, 0, 0) where all three see the same line of the object.
+    ``color_spacing_lines`` is where the red, green and blue sensor lines of a trilinear sensor look along Y at the
+    depth of zero disparity, in nominal lines; (0, 0, 0) where all three see the same line of the object.
     """
 
     width_px: PositiveInt

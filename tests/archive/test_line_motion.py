@@ -20,6 +20,7 @@ from lsvision.io import NewScan, check_product, read_product, write_line_motion,
 from lsvision.simulation import Acquisition, MotionConfig, SceneConfig, SensorConfig, simulate
 from lsvision.stages.line_motion.config import LineMotionConfig
 from lsvision.stages.line_motion.estimate import not_measured
+from lsvision.stages.line_motion.measure import LineMeasurement
 from lsvision.types import LineFinding, LineMotion, Travel
 from tests.archive.archives import (
     PROCESSING,
@@ -44,10 +45,10 @@ def measured(monkeypatch) -> list[int]:
     """The measurement answers at once; the list gets the threads that each had."""
     threads = []
 
-    def measure(scan, depth, motion, config):
+    def measure(scan, depth, motion, config, section):
         threads.append(torch.get_num_threads())
         assert depth.read(0, 2).sigma is None  # heights must not depend on whether the sigma is stored
-        return shaken(depth.lines)
+        return LineMeasurement(shaken(depth.lines))
 
     monkeypatch.setattr("lsvision.archive.line_motion.measure_line_motion", measure)
     return threads
@@ -153,7 +154,7 @@ def test_another_pitch_takes_the_motion_that_is_known(archive, calibration, tmp_
 
 def test_where_nothing_moves_the_product_is_that_of_none(archive, calibration, tmp_path, monkeypatch):
     still = LineMotion(torch.zeros(150, 4).double(), torch.zeros(150, 4, 4).double(), (LineFinding("dz", "absent"),))
-    monkeypatch.setattr("lsvision.archive.line_motion.measure_line_motion", lambda *_: still)
+    monkeypatch.setattr("lsvision.archive.line_motion.measure_line_motion", lambda *_: LineMeasurement(still))
     auto = process_one(plan_one(archive / "a", calibration, AUTO), AUTO, tmp_path / "auto", ignore)
     none = process_one(plan_one(archive / "a", calibration, PROCESSING), PROCESSING, tmp_path / "none", ignore)
     assert planes(read_product(auto.path)) == planes(read_product(none.path))
@@ -262,7 +263,7 @@ def test_what_cannot_be_measured_is_corrected_without(calibration, tmp_path, cap
     """The reason stands in summary, metadata and ledger."""
     caplog.set_level(logging.INFO)
     blind = not_measured(30, "30 of 30 lines show the profile")
-    monkeypatch.setattr("lsvision.archive.line_motion.measure_line_motion", lambda *_: blind)
+    monkeypatch.setattr("lsvision.archive.line_motion.measure_line_motion", lambda *_: LineMeasurement(blind))
     make_scan(tmp_path / "s" / "a", 30, 4)
     stated = correct(tmp_path / "s" / "a", calibration, tmp_path / "o")
     assert stated["corrected"] == []

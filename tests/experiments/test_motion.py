@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 
 from lsvision.io import read_line_motion, read_product
+from lsvision.stages.line_motion.measure import LineMeasurement
 from tests.archive.archives import make_calibration, make_scan, shaken
 from tests.archive.test_line_motion import planes
 
@@ -13,7 +14,9 @@ from tests.archive.test_line_motion import planes
 @pytest.fixture
 def asked(tmp_path: Path, monkeypatch) -> tuple[str, ...]:
     """A scan of 96 lines, whose motion is measured at once, and its calibration."""
-    monkeypatch.setattr("lsvision.archive.line_motion.measure_line_motion", lambda scan, *_: shaken(scan.lines))
+    monkeypatch.setattr(
+        "lsvision.archive.line_motion.measure_line_motion", lambda scan, *_: LineMeasurement(shaken(scan.lines))
+    )
     scan, calibration = make_scan(tmp_path / "rail", stereo=True), make_calibration(tmp_path / "n.json")
     return f"scan={scan}", f"calibration={calibration}", "disparity.halo_lines=8"
 
@@ -51,3 +54,12 @@ def test_a_scan_that_is_not_there_is_one_line(command, tmp_path, capsys):
     assert command("+experiment=motion", "scan=nowhere", f"calibration={make_calibration(tmp_path / 'n.json')}") == 1
     (line,) = capsys.readouterr().err.splitlines()
     assert "nowhere" in line
+
+
+@pytest.mark.parametrize("experiment", ["motion", "correct"])
+def test_a_section_that_cannot_be_read_is_one_line(experiment, asked, command, tmp_path, capsys):
+    section = tmp_path / "worn.csv"
+    section.write_text("across_mm,height_mm\n1.0,2.0\n")
+    assert command(f"+experiment={experiment}", *asked, f"registration.reference={section}") == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert f"{section}: expected at least 8 points, got 1" in line

@@ -141,7 +141,7 @@ def test_equals_the_renderer(transport: str) -> None:
 
     shift = torch.tensor(4 * PITCH, dtype=torch.float64)
     later = frame.shifted_line(line + 3000, shift)
-    shifted = frame.shifted_column(column, zero_disparity_mm(RIG) - found[:, 2], shift, (line + 3000, later))
+    shifted = frame.shifted_column(column, z, shift, (line + 3000, later))
     # In a plane Y = shift the renderer shows a point as if the object lay nearer by the shift.
     y = (points[:, 1] - shift) / frame.n[1]
     moved = displace(torch.stack([torch.zeros_like(y), -y, torch.zeros_like(y)], -1), frame.n) + points

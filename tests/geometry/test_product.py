@@ -147,15 +147,27 @@ def test_heights_are_those_above_the_middle_of_zero_disparity(
 def test_a_shifted_sensor_line_sees_the_same_point() -> None:
     frame, shift = frame_of(), torch.tensor(0.28, dtype=torch.float64)
     column, line, z = samples(50)
-    relief = zero_disparity_mm(RIG) - frame.position(column, line, z)[:, 2]
     # The point at (x, 0, z) on ``line`` has moved by shift / n2 of travel when it crosses the plane Y = shift.
     x = (column - RIG.principal_left_px) / 11384.0 * z
     moved = torch.stack([x, torch.zeros_like(x), z], dim=-1) - frame.n * (-shift / frame.n[1])
     expected, _ = project(RIG, moved[:, 0], moved[:, 2])
-    torch.testing.assert_close(frame.shifted_column(column, relief, shift), expected, rtol=0, atol=1e-8)
+    torch.testing.assert_close(frame.shifted_column(column, z, shift), expected, rtol=0, atol=1e-8)
     later = frame.shifted_line(line, -shift)
     travelled = travel_at(frame.travel, later) - travel_at(frame.travel, line)
     torch.testing.assert_close(travelled, (shift / frame.n[1]).expand_as(line), rtol=0, atol=1e-12)
+
+
+def test_a_sensor_line_beside_looks_along_a_plane_through_the_centre_of_the_camera() -> None:
+    """Y = shift z / z0, at the depth at which the point is seen: it moves in depth until then."""
+    frame, shift = frame_of(), torch.tensor([-0.28, 0.28, 1.4], dtype=torch.float64)[:, None]
+    _, _, z = samples(50)
+    y = frame.plane_y(shift, z)
+    seen_at = z + y * frame.n[2] / frame.n[1]
+    torch.testing.assert_close(y / seen_at, (shift / zero_disparity_mm(RIG)).expand_as(y), rtol=1e-12, atol=0)
+    z0 = zero_disparity_mm(RIG)
+    assert float(frame_of(n=skewed(0.0, 0.0, 1.0)).plane_y(shift[1], z.new_tensor(z0 + 10.0))) == pytest.approx(
+        0.28 * (1 + 10.0 / z0)
+    )
 
 
 def test_motion_sigma_is_the_root_of_the_rotated_covariance() -> None:

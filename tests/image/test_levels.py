@@ -119,3 +119,14 @@ def test_neither_the_rim_of_a_textured_object_nor_an_edge_is_a_fault():
     values = scene(200, noise=0.4)
     values[:, 60:97] += 40 * torch.randn(LINES, 37, generator=generator)
     assert not levels_of(values.clamp(0, 255), torch.uint8).faulty.any()
+
+
+def test_an_edge_that_runs_along_a_column_is_no_fault():
+    """A checkerboard that lies straight: squares of 60 px, edges as blurred as a lens leaves them."""
+    lines, columns = torch.meshgrid(torch.arange(720.0), torch.arange(600.0), indexing="ij")
+    across = torch.sigmoid(2.5 * torch.sin((columns + 25) * torch.pi / 60) * 60 / torch.pi)
+    board = (2 * across - 1) * torch.sin(lines * torch.pi / 60).sign()
+    values = 120 + 80 * board + 1.5 * torch.randn(720, 600, generator=torch.Generator().manual_seed(0))
+    assert not levels_of(values.clamp(0, 255), torch.uint8).faulty.any()
+    values[:, 333] = 120 + 100 * torch.randn(720, generator=torch.Generator().manual_seed(1)).clamp(-1, 1)
+    assert levels_of(values.clamp(0, 255), torch.uint8).faulty.nonzero()[:, 0].tolist() == [333]

@@ -10,7 +10,7 @@ from typing import Annotated
 from pydantic import BeforeValidator
 
 from lsvision.errors import CalibrationError, FileFormatError, UnusableCalibrationError
-from lsvision.io import check_rig_match, read_calibration
+from lsvision.io import check_rig_match, read_calibration, rig_difference
 from lsvision.io.formats.validation import named_file, read_entries, read_yaml
 from lsvision.schema import Checked, Says, Text
 from lsvision.types import Calibration, RefusedVerdict, Scan
@@ -124,7 +124,7 @@ def _fitting(scan: Scan, calibrations: Sequence[DatedCalibration]) -> DatedCalib
     if len(calibrations) == 1 and calibrations[0].first is None and calibrations[0].last is None:
         check_rig_match(calibrations[0].calibration, scan)
         return calibrations[0]
-    same_rig = [item for item in calibrations if item.calibration.rig == scan.rig]
+    same_rig = [item for item in calibrations if rig_difference(item.calibration, scan) is None]
     if not same_rig:
         raise CalibrationError(f"{scan.path}: no calibration for its rig among {len(calibrations)}")
     if len(same_rig) == 1 and same_rig[0].first is None and same_rig[0].last is None:

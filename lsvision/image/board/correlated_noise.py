@@ -9,12 +9,13 @@ Source: Rao 1971, Estimation of variance and covariance components - MINQUE theo
 """
 
 import itertools
-import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
+
+from lsvision.image.board.residuals import Residuals
 
 _SCALES_PX = (1.0, 2.0, 4.0)  # of the correlations of neighbouring pixels
 _LARGEST_CORRELATION = 0.999
@@ -22,69 +23,15 @@ _TRACED = 12  # windows of a board from which the expectation is taken: they are
 
 
 @dataclass(frozen=True)
-class Residuals:
-    """What fits have left of square windows, ``pixels = size²``, and how their corners follow from the pixels.
-
-    The residual is orthogonal to the ``jacobian``, the derivative of the window by the parameters, of which the first
-    two are the corner; all are 0 at pixels that are not fitted, where the ``weight`` is 0. ``influence`` is the shift
-    of the corner by the noise of each pixel, ``corner`` is (u, v) from the middle of the window, px.
-    """
-
-    residual: Float[Tensor, "fits pixels"]
-    weight: Float[Tensor, "fits pixels"]
-    jacobian: Float[Tensor, "fits parameters pixels"]
-    influence: Float[Tensor, "fits 2 pixels"]
-    corner: Float[Tensor, "fits 2"]
-
-    @property
-    def size(self) -> int:
-        """Pixels across a window."""
-        return math.isqrt(self.residual.shape[-1])
-
-    @property
-    def steepness(self) -> Float[Tensor, "fits pixels"]:
-        """Gradient of the window, of rms 1: large on the edges of the squares."""
-        gradient = self.jacobian[:, :2].square().sum(1)
-        return (gradient / gradient.mean(-1, keepdim=True).clamp(min=torch.finfo(gradient.dtype).tiny)).sqrt()
-
-    def basis(self) -> Float[Tensor, "fits parameters pixels"]:
-        """Orthonormal rows that span the Jacobian's."""
-        return torch.linalg.qr(self.jacobian.mT).Q.mT
-
-    def of(self, fits: Tensor | slice) -> "Residuals":
-        """Some of the fits."""
-        return Residuals(
-            self.residual[fits], self.weight[fits], self.jacobian[fits], self.influence[fits], self.corner[fits]
-        )
-
-    def without(self, difference: Float[Tensor, "fits pixels"]) -> "Residuals":
-        """What fits would have left of windows without a difference from the model."""
-        taken = torch.linalg.qr(self.jacobian.mT).Q
-        left = difference[:, None] - (difference[:, None] @ taken) @ taken.mT
-        return replace(self, residual=self.residual - left[:, 0])
-
-    def cropped(self, size: int) -> "Residuals":
-        """The middle of the windows."""
-        rim = (self.size - size) // 2
-        inner = torch.arange(self.size**2).reshape(self.size, self.size)[rim : rim + size, rim : rim + size].flatten()
-        return Residuals(
-            self.residual[:, inner],
-            self.weight[:, inner],
-            self.jacobian[..., inner],
-            self.influence[..., inner],
-            self.corner,
-        )
-
-
-@dataclass(frozen=True)
 class Correlation:
     """Covariances of the pixels of one window with those of another, for each kind of noise of unit strength.
 
-    Each is a product along the lines and across them, times the amplitude of the noise in either pixel.
+    Each is a product along the lines and across them, times the amplitude of the noise in either pixel. Within an image
+    the products are the same for all fits, and ``places`` is 1; it is the number of fits between two images.
     """
 
-    along_v: Float[Tensor, "kinds fits size size"]
-    along_u: Float[Tensor, "kinds fits size size"]
+    along_v: Float[Tensor, "kinds places size size"]
+    along_u: Float[Tensor, "kinds places size size"]
     first: Float[Tensor, "kinds fits pixels"]
     second: Float[Tensor, "kinds fits pixels"]
 
@@ -92,9 +39,9 @@ class Correlation:
     def between(cls, first: Residuals, second: Residuals, dtype: torch.dtype) -> "Correlation":
         """Of windows of the same size around the same corners."""
         index = torch.arange(first.size, dtype=dtype)
-        shift = (second.corner - first.corner).to(dtype)
+        shift = (first.corner[:1] * 0 if first is second else second.corner - first.corner).to(dtype)
         lag = index[:, None] - index + shift.mT[..., None, None]  # u and v, fits, size, size
-        box, wide = (1 - lag.abs()).clamp(min=0), [torch.exp(-0.5 * (lag / s).square()) for s in _SCALES_PX]
+        box, wide = (1 - lag.abs()).clamp(min=0), [_bell(lag / scale) for scale in _SCALES_PX]
         along_u, along_v = torch.stack([box, *wide, box], dim=1)
         amplitudes = (
             torch.stack([*[torch.ones_like(fits.residual)] * (1 + len(wide)), fits.steepness]).to(dtype)
@@ -104,10 +51,12 @@ class Correlation:
 
     def times(self, images: Float[Tensor, "fits rows pixels"]) -> Float[Tensor, "kinds fits rows pixels"]:
         """Each applied to images in the second window: images in the first."""
-        size = self.along_u.shape[-1]
-        squares = (images * self.second[:, :, None]).unflatten(-1, (size, size))
-        applied = self.along_v[:, :, None] @ squares @ self.along_u.mT[:, :, None]
-        return applied.flatten(-2) * self.first[:, :, None]
+        kinds, places, size, _ = self.along_u.shape
+        scaled = images * self.second[:, :, None]
+        # All lines of a place in one product with the columns, then all columns in one with the lines.
+        by_u = (scaled.reshape(kinds, places, -1, size) @ self.along_u.mT).reshape(*scaled.shape[:3], size, size)
+        by_v = (by_u.mT.reshape(kinds, places, -1, size) @ self.along_v.mT).reshape(by_u.shape)
+        return by_v.mT.flatten(-2) * self.first[:, :, None]
 
     def transposed(self) -> "Correlation":
         """Of the second window with the first."""
@@ -120,7 +69,14 @@ class Correlation:
 
     def of(self, fits: slice) -> "Correlation":
         """Some of the fits."""
-        return Correlation(self.along_v[:, fits], self.along_u[:, fits], self.first[:, fits], self.second[:, fits])
+        places = slice(None) if self.along_u.shape[1] == 1 else fits
+        return Correlation(self.along_v[:, places], self.along_u[:, places], self.first[:, fits], self.second[:, fits])
+
+
+def _bell(x: Tensor) -> Tensor:
+    """``exp(-x²/2)``, 0 where that is nothing beside 1: products with denormal numbers take ten times as long."""
+    bell = torch.exp(-0.5 * x.square())
+    return torch.where(bell > torch.finfo(x.dtype).eps ** 2, bell, 0.0)
 
 
 @dataclass(frozen=True)
@@ -187,8 +143,9 @@ def corner_covariance(
         first, second: fits of the same corners in windows of one size; the same for the covariance within an image.
         strength: variance of each kind of noise.
     """
-    moved = Correlation.between(first, second, torch.float32).times(second.influence.float()).to(first.residual)
-    return torch.einsum("k, fip, kfjp -> fij", strength, first.influence, moved)
+    moved = Correlation.between(first, second, torch.float32).times(second.influence.float())
+    moved = torch.tensordot(strength.float(), moved, dims=1).to(first.residual)
+    return first.influence @ moved.mT
 
 
 def _of_one_size(first: Residuals, second: Residuals) -> tuple[Residuals, Residuals]:

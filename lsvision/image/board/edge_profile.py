@@ -22,7 +22,7 @@ from dataclasses import dataclass, replace
 
 import torch
 import torch.nn.functional as F  # noqa: N812
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from lsvision.image.board.correlated_noise import BoardNoise, corner_covariance
@@ -34,7 +34,9 @@ _LARGEST_BLUR_PX = 0.8  # of what repeats with the pixels exp(-π² blur²), 0.0
 _KNOTS, _KNOT_SPACING = 50, 0.1  # of the distance from an edge; spacing over the standard deviation of the edge
 _KNOWN = len(FULL.free) + 1  # rows of a fit's Jacobian: its parameters, and the square of the brightness, which is even
 _MOVES = 264  # over which the mean square is taken: three in each window of a full board
+_MOVED_TOGETHER = 66  # windows whose pixels stay in the processor's cache
 _PLASTIC = 1.32471795724474602596  # spreads points evenly over a square (Roberts 2018, R2 sequence)
+_BEFORE, _PAST = 1, 2  # of the places between knots that a pixel can have, before the first knot and past the last
 _LEAST_VARIANCE, _LEAST_RIDGE = 1e-12, 1e-9  # no profile was seen; without noise the matrix is singular
 
 
@@ -57,13 +59,15 @@ class EdgeProfile:
         """
         width = (fit.parameters.blur[valid].square().mean() + PIXEL_VARIANCE).sqrt()
         knots = _KNOT_SPACING * width * (torch.arange(_KNOTS).to(width) + 0.5)
-        # Seven digits are plenty, and half the time.
-        shapes = _odd_shapes(fit.saddles(valid), knots).float() * fit.residuals.weight[valid][:, None].float()
+        shapes = _KnotShapes.of(fit.saddles(valid), fit.residuals.weight[valid], knots)
+        known = fit.residuals.jacobian[valid][:, :_KNOWN]
         # The misfit is not orthogonal to the blur where that is at its bound.
-        known = torch.linalg.qr(fit.residuals.jacobian[valid][:, :_KNOWN].mT).Q.float()
-        left = shapes - (shapes @ known) @ known.mT
-        normal = (left @ shapes.mT).sum(0).to(knots)
-        right = (left @ fit.misfit[valid][..., None].float()).sum(0)[:, 0].to(knots)
+        misfit = fit.misfit[valid][..., None]
+        seen = shapes.products(torch.cat([known.mT, misfit], dim=-1))
+        by_known, by_misfit = seen[..., :-1], seen[..., -1]
+        taken = by_known @ NormalMatrix.of(known).inverse()
+        normal = shapes.gram() - torch.einsum("cik, cjk -> ij", taken, by_known)
+        right = by_misfit.sum(0) - torch.einsum("cik, ck -> i", taken, (known @ misfit)[..., 0])
         noise = fit.residual[valid].square().mean()
         variance = (right.square().sum() - noise * normal.trace()) / normal.square().sum()
         normal.diagonal().add_(noise / variance.clamp(min=_LEAST_VARIANCE) + _LEAST_RIDGE * normal.diagonal().mean())
@@ -71,15 +75,20 @@ class EdgeProfile:
 
     def values(self, saddles: Saddle) -> Float[Tensor, "corners pixels"]:
         """Difference of the grey values from the model's."""
-        edges = zip(saddles.edges, self.amount.unflatten(0, (2, -1)), saddles.steps().unbind(1), strict=True)
-        return torch.stack([self._at(edge.across, amount) * step for edge, amount, step in edges]).sum(0)
+        across, steps = saddles.edges.across, saddles.steps()
+        near = (across.abs() < self.knots[-1] + 2 * self.knots[0]).nonzero()
+        window, edge, pixel = near.unbind(-1)
+        values = self._at(across[window, edge, pixel], edge) * steps[window, edge, pixel]
+        size = steps.shape[-1]
+        whole = values.new_zeros(len(steps) * size).index_add_(0, window * size + pixel, values)
+        return whole.unflatten(0, (-1, size))
 
-    def _at(self, across: Float[Tensor, "corners pixels"], amount: Float[Tensor, " knots"]) -> Tensor:
-        """One edge's profile at signed distances from it; 0 half a spacing before the first knot and past the last."""
-        padded = F.pad(amount, (1, 2))
-        place = (across.abs() / (self.knots[1] - self.knots[0]) + 0.5).clamp(max=len(amount) + 1)
+    def _at(self, across: Float[Tensor, " near"], edge: Int[Tensor, " near"]) -> Float[Tensor, " near"]:
+        """The profile of an edge at signed distances; 0 half a spacing before the first knot and past the last."""
+        padded = F.pad(self.amount.unflatten(0, (2, -1)), (1, 2))
+        place = (across.abs() / (self.knots[1] - self.knots[0]) + 0.5).clamp(max=len(self.knots) + 1)
         before = place.long()
-        return across.sign() * torch.lerp(padded[before], padded[before + 1], place - before)
+        return across.sign() * torch.lerp(padded[edge, before], padded[edge, before + 1], place - before)
 
     def moves(self, fit: SaddleFit, valid: Bool[Tensor, " corners"]) -> Float[Tensor, "moves 2"]:
         """How far corners move, px, each with its window at some places between the pixels."""
@@ -88,8 +97,15 @@ class EdgeProfile:
         columns = fit.parameters.columns[some].clone()
         order = torch.arange(1, _MOVES + 1).to(columns)
         columns[:, POSITION] = torch.stack([order / _PLASTIC, order / _PLASTIC**2], dim=-1) % 1 - 0.5
-        saddles = Saddle.on_grid(SaddleParameters(columns), fit.grid)
-        jacobian = saddles.jacobian(FULL) * fit.residuals.weight[some][:, None]
+        weight = fit.residuals.weight[some]
+        parts = zip(columns.split(_MOVED_TOGETHER), weight.split(_MOVED_TOGETHER), strict=True)
+        return torch.cat(
+            [self._moved_by(Saddle.on_grid(SaddleParameters(each), fit.grid), inside) for each, inside in parts]
+        )
+
+    def _moved_by(self, saddles: Saddle, weight: Float[Tensor, "corners pixels"]) -> Float[Tensor, "corners 2"]:
+        """How far the profile moves corners, px."""
+        jacobian = saddles.jacobian(FULL, weight)
         pushed = jacobian @ self.values(saddles)[..., None]
         return (NormalMatrix.of(jacobian).inverse()[:, POSITION] @ pushed)[..., 0]
 
@@ -120,8 +136,65 @@ def _moved_by_independent_noise(noise: BoardNoise, difference: Tensor, valid: Te
     return corner_covariance(seen, seen, strength).mean(0).trace()
 
 
-def _odd_shapes(saddles: Saddle, knots: Float[Tensor, " knots"]) -> Float[Tensor, "corners twice_the_knots pixels"]:
-    """Change of the grey values by the value of the profile at each knot, of either edge."""
-    across = torch.stack([edge.across for edge in saddles.edges], dim=1)
-    hats = (1 - (across.abs()[:, :, None] - knots[:, None]).abs() / (knots[1] - knots[0])).clamp(min=0)
-    return (hats * (across.sign() * saddles.steps())[:, :, None]).flatten(1, 2)
+@dataclass(frozen=True)
+class _KnotShapes:
+    """Change of the grey values by the value of the profile at each knot of either edge: four numbers a pixel.
+
+    A pixel lies between two knots of each edge, or farther from it than all. ``knot`` and ``change`` have a row for
+    each pixel of any window that is near an edge. Each edge's knots are counted with some before the first and past the
+    last, which are left out in the end.
+    """
+
+    windows: int
+    knots: int
+    window: Int[Tensor, " near"]
+    pixel: Int[Tensor, " near"]
+    knot: Int[Tensor, "near 4"]
+    change: Float[Tensor, "near 4"]
+
+    @classmethod
+    def of(
+        cls, saddles: Saddle, weight: Float[Tensor, "windows pixels"], knots: Float[Tensor, " knots"]
+    ) -> "_KnotShapes":
+        """Shapes of saddles in weighted pixels, for knots at some distances from the edges."""
+        across = saddles.edges.across
+        place = across.abs() / (knots[1] - knots[0]) - 0.5
+        window, pixel = ((place < len(knots)).any(1) & (weight > 0)).nonzero().unbind(-1)
+        change = across.sign() * saddles.steps() * weight[:, None]
+        place, change = (each[window, :, pixel] for each in (place, change))
+        before = place.floor().clamp(max=len(knots))
+        after = (place - before).clamp(max=1) * change
+        first = before.long() + _BEFORE + (len(knots) + _BEFORE + _PAST) * torch.arange(2, device=before.device)
+        return cls(
+            windows=len(weight),
+            knots=len(knots),
+            window=window,
+            pixel=pixel,
+            knot=torch.cat([first, first + 1], dim=-1),
+            change=torch.cat([change - after, after], dim=-1),
+        )
+
+    def products(
+        self, images: Float[Tensor, "windows pixels images"]
+    ) -> Float[Tensor, "windows twice_the_knots images"]:
+        """Each shape times images of its window."""
+        parts = self.change[:, :, None] * images[self.window, self.pixel][:, None]
+        row = self.window[:, None] * self._counted + self.knot
+        summed = images.new_zeros(self.windows * self._counted, images.shape[-1])
+        summed.scatter_add_(0, row.flatten()[:, None].expand(-1, images.shape[-1]), parts.flatten(0, 1))
+        return self._inner(summed.unflatten(0, (self.windows, -1)), 1)
+
+    def gram(self) -> Float[Tensor, "twice_the_knots twice_the_knots"]:
+        """Products of the shapes with one another, summed over the windows."""
+        parts = self.change[:, :, None] * self.change[:, None]
+        place = self.knot[:, :, None] * self._counted + self.knot[:, None]
+        summed = parts.new_zeros(self._counted**2).index_add_(0, place.flatten(), parts.flatten())
+        return self._inner(self._inner(summed.unflatten(0, (self._counted, -1)), 0), 1)
+
+    @property
+    def _counted(self) -> int:
+        return 2 * (self.knots + _BEFORE + _PAST)
+
+    def _inner(self, summed: Tensor, dim: int) -> Tensor:
+        """Without what lies before the first knot or past the last."""
+        return summed.unflatten(dim, (2, -1)).narrow(dim + 1, _BEFORE, self.knots).flatten(dim, dim + 1)

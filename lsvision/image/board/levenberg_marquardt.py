@@ -11,10 +11,11 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from lsvision.image.board.saddle_model import POSITION, Saddle, SaddleModel, SaddleParameters
+from lsvision.image.board.saddle_model import BLUR, POSITION, Saddle, SaddleModel, SaddleParameters
 
 _FIRST_DAMPING = 1e-3
 _DAMPING_RANGE = 1e-9, 1e6
+_SMALLEST_PIVOT = 1e-6  # of the Cholesky factor of a matrix with ones on its diagonal
 _BLUR_RANGE_PX = 0.1, 20.0  # a pixel averages over more than a tenth of a pixel: sharper edges look the same
 
 
@@ -63,8 +64,13 @@ class Linearisation:
         """Compare saddles with windows, and differentiate them by the free parameters of a model."""
         saddle = Saddle.on_grid(parameters, windows.grid)
         residual = windows.values - saddle.values() * windows.weight
-        jacobian = saddle.jacobian(model).mul_(windows.weight[:, None])
+        jacobian = saddle.jacobian(model, windows.weight)
         return cls(parameters.columns, residual, jacobian, residual.square().sum(-1))
+
+    @property
+    def parameters(self) -> SaddleParameters:
+        """Of the saddles."""
+        return SaddleParameters(self.columns)
 
     def improved_by(self, trial: "Linearisation", better: Bool[Tensor, " corners"]) -> "Linearisation":
         """The trial where it is better, this elsewhere; no copy where all are better."""
@@ -89,6 +95,15 @@ class NormalMatrix:
         length = torch.where(length > 0, length, 1.0)  # without contrast nothing moves the corner
         return cls(normal / (length[:, None] * length[..., None]), length)
 
+    def without(self, parameter: int, corners: Bool[Tensor, " corners"]) -> "NormalMatrix":
+        """As if a parameter of some corners changed nothing."""
+        scaled, length = self.scaled.clone(), self.length.clone()
+        scaled[corners, parameter] = 0
+        scaled[corners, :, parameter] = 0
+        scaled[corners, parameter, parameter] = 1
+        length[corners, parameter] = torch.inf
+        return NormalMatrix(scaled, length)
+
     def damped_solution(self, gradient: Tensor, damping: Tensor) -> Tensor:
         """Steps (corners, parameters): solutions of ``(J Jᵀ + damping D²) step = gradient``, D the rows' lengths."""
         damped = self.scaled.clone()
@@ -96,19 +111,27 @@ class NormalMatrix:
         return torch.linalg.solve(damped, gradient / self.length) / self.length
 
     def inverse(self) -> Tensor:
-        """``(J Jᵀ)⁻¹``, in the unit of the parameters."""
-        inverse = torch.linalg.pinv(self.scaled, hermitian=True)
+        """``(J Jᵀ)⁻¹``, in the unit of the parameters; the pseudo-inverse of what is about singular."""
+        # A tenth of the time of pseudo-inverses of all.
+        root, _ = torch.linalg.cholesky_ex(self.scaled)
+        singular = ~(root.diagonal(dim1=-2, dim2=-1).amin(-1) > _SMALLEST_PIVOT)
+        inverse = torch.empty_like(root)
+        inverse[~singular] = torch.cholesky_inverse(root[~singular])
+        inverse[singular] = torch.linalg.pinv(self.scaled[singular], hermitian=True)
         return inverse / (self.length[:, None] * self.length[..., None])
 
 
 def fit_parameters(
     windows: Windows, start: SaddleParameters, model: SaddleModel, smallest_step_px: float, iterations: int
-) -> SaddleParameters:
+) -> Linearisation:
     """Minimise each window's sum of squared residuals over the free parameters of a model.
 
     Args:
         smallest_step_px: a window whose corner moves by no more than this is finished.
         iterations: largest number of steps.
+
+    Returns:
+        The saddles found, compared with their windows.
     """
     current = Linearisation.of(windows, start, model)
     damping = torch.full_like(current.cost, _FIRST_DAMPING)
@@ -122,14 +145,23 @@ def fit_parameters(
         moving = moving & (torch.linalg.vector_norm(step[:, POSITION], dim=-1) > smallest_step_px)
         if not bool(moving.any()):
             break
-    return SaddleParameters(current.columns)
+    return current
 
 
 def _damped_step(current: Linearisation, model: SaddleModel, damping: Tensor) -> Tensor:
-    """Step (corners, 17), 0 in the parameters that are not free."""
+    """Step (corners, 17), 0 in the parameters that are not free.
+
+    A blur at the end of its range that would leave it stays: the other parameters go where they fit best with it.
+    """
     gradient = (current.jacobian @ current.residual[..., None])[..., 0]
+    normal = NormalMatrix.of(current.jacobian)
     step = torch.zeros_like(current.columns)
-    step[:, model.free] = NormalMatrix.of(current.jacobian).damped_solution(gradient, damping)
+    step[:, model.free] = normal.damped_solution(gradient, damping)
+    smallest, largest = _BLUR_RANGE_PX
+    blur, change = current.columns[:, BLUR], step[:, BLUR]
+    held = ((blur <= smallest) & (change < 0)) | ((blur >= largest) & (change > 0))
+    if bool(held.any()):
+        step[:, model.free] = normal.without(BLUR, held).damped_solution(gradient, damping)
     return step
 
 

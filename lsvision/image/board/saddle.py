@@ -8,7 +8,6 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from lsvision.image.board.correlated_noise import Residuals
 from lsvision.image.board.levenberg_marquardt import (
     Linearisation,
     NormalMatrix,
@@ -16,6 +15,7 @@ from lsvision.image.board.levenberg_marquardt import (
     fit_parameters,
     pixel_grid,
 )
+from lsvision.image.board.residuals import Residuals
 from lsvision.image.board.saddle_model import (
     FULL,
     PARAMETERS,
@@ -26,9 +26,9 @@ from lsvision.image.board.saddle_model import (
     SaddleParameters,
 )
 
-_TOGETHER = 2**18  # values of a Jacobian that stay in the processor's cache
+_TOGETHER = 2**19  # values of a Jacobian that stay in the processor's cache
 # The corner of the plain saddle only starts the full one, whose corner is measured.
-_PLAIN_STEP_PX, _FULL_STEP_PX = 1e-2, 1e-5
+_PLAIN_STEP_PX, _FULL_STEP_PX = 3e-2, 2e-4
 _SMALLEST_CROSSING = 0.2  # sine of the angle between edges: nearly parallel ones cross in no corner
 
 
@@ -96,8 +96,8 @@ def fit_saddles(
     if mask is None:
         mask = torch.ones_like(windows, dtype=torch.bool)
     options = options or SaddleOptions()
-    together = max(1, _TOGETHER // (PARAMETERS * windows.shape[-1] ** 2))
-    parts = zip(windows.split(together), angles.split(together), mask.split(together), strict=True)
+    count = max(1, round(PARAMETERS * windows.numel() / _TOGETHER))
+    parts = zip(*(each.tensor_split(count) for each in (windows, angles, mask)), strict=True)
     fits = [_fit_together(Windows.of_pixels(pixels, inside), turned, options) for pixels, turned, inside in parts]
     return _joined(SaddleFit, fits)
 
@@ -110,11 +110,12 @@ def _joined(kind: type, parts: Sequence[Any]) -> Any:
 
 def _fit_together(windows: Windows, angles: Tensor, options: SaddleOptions) -> SaddleFit:
     # The plain saddle has few minima; the full one then starts inside the right one of its many.
-    parameters = _start(windows, angles)
-    parameters = fit_parameters(windows, parameters, PLAIN, _PLAIN_STEP_PX, options.iterations)
-    if not options.plain:
-        parameters = fit_parameters(windows, parameters, FULL, _FULL_STEP_PX, options.iterations)
-    fitted = Linearisation.of(windows, parameters, FULL)
+    plain = fit_parameters(windows, _start(windows, angles), PLAIN, _PLAIN_STEP_PX, options.iterations)
+    if options.plain:
+        fitted = Linearisation.of(windows, plain.parameters, FULL)
+    else:
+        fitted = fit_parameters(windows, plain.parameters, FULL, _FULL_STEP_PX, options.iterations)
+    parameters = fitted.parameters
     variance = fitted.cost / (windows.weight.sum(-1) - PARAMETERS).clamp(min=1)
     inverse_normal = NormalMatrix.of(fitted.jacobian).inverse()
     influence = inverse_normal[:, POSITION] @ fitted.jacobian

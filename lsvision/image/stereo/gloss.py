@@ -18,6 +18,7 @@ from torch import Tensor
 
 from lsvision.image.stereo.blocks import block_side, enlarged, repeated, whole_blocks
 from lsvision.image.stereo.clipping import UnusableSamples
+from lsvision.image.stereo.differences import second_difference, slope
 from lsvision.image.stereo.warp import warp_cubic
 from lsvision.image.stereo.windows import Windows
 from lsvision.image.tiling import HaloRange, halo_ranges, in_parallel
@@ -150,14 +151,16 @@ class _Detail:
     def proof(self, noise: Tensor) -> DetailProof:
         """What windows prove, from the variance of the noise of an image."""
         block = block_side(self.left, self.matched)
-        left, residual = _slopes(self.left), _slopes(self.residual)
+        left, residual = slope(self.left), slope(self.residual)
         reach = _APART // 2 // block
         along, across, both = self._windows(reach, 0), self._windows(0, 1), self._windows(reach, 1)
         mean = across.mean(left)
         texture = across.covariance(left, left, mean, mean).sub_(noise, alpha=0.5)
         values = _Energy.of(along, _along(self.left), _along(self.residual), noise * _OF_VALUES)
         slopes = _Energy.of(both, _along(left), _along(residual), noise * _OF_SLOPES)
-        sharp = _Energy.of(across, _curvature(self.left), _curvature(self.residual), noise * _OF_CURVATURE)
+        sharp = _Energy.of(
+            across, second_difference(self.left), second_difference(self.residual), noise * _OF_CURVATURE
+        )
         changing = slopes.exceeds(_ALONG_NOISE, _ALONG_SLOPE * texture) & slopes.is_explained()
         edges = sharp.exceeds(_SHARP_NOISE, _SHARP_SLOPE * texture) & sharp.is_explained()
         proven = (changing | edges) & values.is_explained(least=2.0 * values.noise)
@@ -168,9 +171,9 @@ class _Detail:
         windows, reach, block = self._windows(0, 0), self.window // 2, block_side(self.left, self.matched)
         mean = windows.mean(self.residual)
         apart = 2 * reach * block
-        slope = F.pad(mean[:, 2 * reach :] - mean[:, : -2 * reach], (reach, reach)).div_(apart)
+        across = F.pad(mean[:, 2 * reach :] - mean[:, : -2 * reach], (reach, reach)).div_(apart)
         own = noise * (2 * RESIDUAL_NOISE / (self.window * block * apart) ** 2)
-        light = slope.square_().sub_(own).clamp_(min=0)
+        light = across.square_().sub_(own).clamp_(min=0)
         spread = ((self.window * block) ** 2 - 1) / 12.0  # variance of the columns of a window
         return light.mul_(_LIKE_SHIFT**2 * spread).div_(torch.maximum(texture, noise))
 
@@ -206,16 +209,6 @@ class _Energy:
         """Whether the match explains most of it; of less than ``least`` it need not explain more."""
         own = self.left if least is None else torch.maximum(self.left, least)
         return self.residual < _EXPLAINED * own
-
-
-def _slopes(image: Tensor) -> Tensor:
-    """Slopes along the line, grey values a px."""
-    return F.pad(image[:, 2:] - image[:, :-2], (1, 1)).mul_(0.5)
-
-
-def _curvature(image: Tensor) -> Tensor:
-    """Second differences along the line."""
-    return F.pad(torch.add(image[:, 2:], image[:, :-2]).sub_(image[:, 1:-1], alpha=2), (1, 1))
 
 
 def _along(image: Tensor) -> Tensor:

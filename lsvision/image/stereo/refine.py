@@ -2,7 +2,7 @@
 
 In the window around each block
 
-1. the right image is warped by the current disparity (``warp_cubic``),
+1. the right image is warped by the current disparity (``CubicLines``),
 2. least squares give the shift that fits it to the left image best (``LeftWindows.fit``),
 3. the disparity takes this step, and after the last one
 4. the variance of the residual and the texture give the step's sigma (``LeftWindows.certainty``).
@@ -23,7 +23,7 @@ from lsvision.image.stereo.blocks import block_side, enlarged, whole_blocks
 from lsvision.image.stereo.scatter import SigmaGains, with_scatter
 from lsvision.image.stereo.shift import Certainty, LeftWindows, explained_share
 from lsvision.image.stereo.texture import TextureSupport, texture_support
-from lsvision.image.stereo.warp import warp_cubic
+from lsvision.image.stereo.warp import CubicLines
 from lsvision.image.stereo.windows import Windows
 from lsvision.image.tiling import HaloRange, halo_ranges, in_parallel
 
@@ -32,7 +32,7 @@ _TILE_LINES, _TILE_COLUMNS = 256, 1024
 _SAME_SURFACE_PX = 0.5  # from the mean of a window
 _LARGEST_STEP_PX = 0.5
 _NOISE_RESIDUAL = 4.0  # times the variance of the noise in one image; that of two images is twice as large
-_EXPLAINED = 6.25  # the largest sigma grows by so many times with the share of the grey values that the match explains
+_EXPLAINED = 6.0  # the largest sigma grows by so many times with the share of the grey values that the match explains
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class RefineOptions:
         noise: sigma of the noise of grey values, on their scale.
         largest_change_px: a larger total change is implausible and is undone.
         largest_sigma_px: a pixel of larger sigma is dropped where the match explains nothing of the grey values around
-            it; where it explains all, noise aside, 7.25 times as much is allowed. Infinity keeps all.
+            it; where it explains all, noise aside, 7 times as much is allowed. Infinity keeps all.
         largest_misfit_px: a pixel whose residual is above noise, and would explain a shift by more than this, is
             dropped: ground without texture gives little information, but a wrong match gives wrong information.
         with_gain: brightness may differ by a factor, too, not by an offset only.
@@ -126,7 +126,8 @@ def refine_disparity(
 
     def refine_rows(rows: HaloRange) -> None:
         """Refine a row of tiles."""
-        left_rows, right_rows = (whole_blocks(image, rows.outer, block) for image in (left, right))
+        left_rows = whole_blocks(left, rows.outer, block)
+        right_rows = CubicLines.of(whole_blocks(right, rows.outer, block))
         for columns in halo_ranges(disparity.shape[1], _TILE_COLUMNS // block, halo):
             start = disparity[rows.outer, columns.outer]
             pixels = slice(block * columns.outer_start, block * columns.outer_stop)
@@ -152,7 +153,9 @@ class _Refined:
     support: TextureSupport | None
 
 
-def _refine_blocks(left: Tensor, right: Tensor, start: Tensor, first_column: int, options: RefineOptions) -> _Refined:
+def _refine_blocks(
+    left: Tensor, right: CubicLines, start: Tensor, first_column: int, options: RefineOptions
+) -> _Refined:
     """Least squares in the windows of a tile, from the disparities ``start`` of its blocks on.
 
     Args:
@@ -165,7 +168,7 @@ def _refine_blocks(left: Tensor, right: Tensor, start: Tensor, first_column: int
     disparity = torch.nan_to_num(start)
     for _ in range(options.iterations):
         disparity = _smoothed(disparity, windows)
-        residual = left - warp_cubic(right, enlarged(disparity, block), first_column)
+        residual = left - right.at(enlarged(disparity, block), first_column)
         fit = equations.fit(residual)
         disparity.sub_(fit.step.clamp(-_LARGEST_STEP_PX, _LARGEST_STEP_PX))
     certainty = equations.certainty(residual, fit) if options.judges else None

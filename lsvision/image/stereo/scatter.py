@@ -15,10 +15,12 @@ from lsvision.image.stereo.windows import Windows
 
 # Errors over those that the scatter of independent ones would mean, on rendered pairs and photographs: errors of the
 # search, which a step does not average away, scatter more than others.
-_SCATTERED = 0.9
+_SCATTERED = 0.92
+# Largest part of errors wider than a window, over that of independent ones: what looks like more is the surface's bend.
+_WIDEST = 1.25
 _STEP_PX = 0.8  # a larger deviation is that of another surface
 # The share of the predicted variance: it covers smooth ground, which matching holds where it was, right or wrong.
-_PREDICTED = 0.15
+_PREDICTED = 0.08
 _INTERPOLATION_PX = 0.01  # what interpolation between pixels leaves at best, from the errors of rendered pairs
 
 
@@ -33,10 +35,12 @@ class SigmaGains:
     Args:
         iterations: sigma after all iterations over that of a single one.
         scatter: sigma over the rms deviation from the mean over a window.
+        wide: variance that deviations lack, over the mean square of their own mean over a window.
     """
 
     iterations: float
     scatter: float
+    wide: float
 
     @classmethod
     def of(cls, window: int, iterations: int) -> "SigmaGains":
@@ -49,10 +53,11 @@ class SigmaGains:
         result = mean
         for _ in range(iterations - 1):
             result = mean + (1 - mean) * mean * result
-        single, final, scatter = (
-            float(response.square().mean().sqrt()) for response in (mean, result, (1 - mean) * result)
+        deviation = (1 - mean) * result
+        single, final, scatter, smooth = (
+            float(response.square().mean().sqrt()) for response in (mean, result, deviation, mean * deviation)
         )
-        return cls(final / single, final / scatter)
+        return cls(final / single, final / scatter, (final**2 - scatter**2) / smooth**2)
 
 
 def with_scatter(
@@ -70,5 +75,8 @@ def with_scatter(
     """
     known = torch.nan_to_num(disparity)
     deviation = windows.mean(known).sub_(known).clamp_(-_STEP_PX, _STEP_PX)
-    variance = windows.mean(deviation.square_()).mul_((_SCATTERED * gains.scatter) ** 2)
+    smooth = windows.mean(deviation)
+    seen = windows.mean(deviation.square_())
+    wide = windows.mean(smooth.square_()).mul_(gains.wide)
+    variance = torch.minimum(wide.add_(seen), seen * (_WIDEST * gains.scatter**2)).mul_(_SCATTERED**2)
     return variance.addcmul_(predicted, predicted, value=_PREDICTED).add_(_INTERPOLATION_PX**2).sqrt_()

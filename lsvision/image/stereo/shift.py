@@ -10,10 +10,10 @@ Gruen 1985, Adaptive least squares correlation, for brightness as an unknown.
 
 from dataclasses import dataclass
 
-import torch.nn.functional as F  # noqa: N812
 from jaxtyping import Float
 from torch import Tensor
 
+from lsvision.image.stereo import differences
 from lsvision.image.stereo.windows import Windows
 
 _ROUNDING = 1.0 / 6.0  # variance of the difference of two whole grey values
@@ -73,7 +73,7 @@ class LeftWindows:
         """Those of the windows around some blocks of an image; ``with_gain``: brightness may differ by a factor."""
         # The slope of the left image has noise independent of the right one. Interpolation smooths the right image
         # between its pixels: a slope that shared its noise would pull disparities towards the middle between them.
-        slope = F.pad(left[:, 2:] - left[:, :-2], (1, 1)).mul_(0.5)
+        slope = differences.slope(left)
         mean_slope = windows.mean(slope)
         texture = windows.covariance(slope, slope, mean_slope, mean_slope)
         brightness = Brightness.of(left, slope, mean_slope, windows) if with_gain else None

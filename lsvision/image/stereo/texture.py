@@ -10,10 +10,10 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 import torch
-import torch.nn.functional as F  # noqa: N812
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from lsvision.image.stereo.differences import second_difference
 from lsvision.image.stereo.shift import SLOPE_NOISE, LeftWindows
 from lsvision.image.stereo.windows import window_sum
 
@@ -45,11 +45,12 @@ def texture_support(
 ) -> TextureSupport:
     """Compare the slopes in windows with those of noise alone, and find where in the windows they lie.
 
-    The noise is the least of three: what the match leaves in the window, which a mismatch makes too large; what the
-    window's second differences could be, which fine texture makes too large; and the given one.
+    The noise is the lesser of two: what the match leaves in the window, which a mismatch makes too large, and what the
+    window's second differences could be, which fine texture makes too large. The given one is not asked: that of dark
+    scans is far larger.
 
     Args:
-        equations: of the left image, its windows and the largest noise of its grey values.
+        equations: of the left image and its windows.
         residual_variance: of the grey values that the match leaves in each window.
         confidence: by how many standard deviations the slopes must exceed noise.
     """
@@ -60,10 +61,9 @@ def texture_support(
     def mean(values: Tensor) -> Tensor:
         return window_sum(values * windows.weight, size).div_(count)
 
-    left = equations.left
-    curvature = F.pad(torch.add(left[:, 2:], left[:, :-2]).sub_(left[:, 1:-1], alpha=2), (1, 1))
+    curvature = second_difference(equations.left)
     by_curvature = mean(windows.reduced(curvature.square_())).mul_(_CURVATURE_NOISE)
-    expected = torch.minimum(residual_variance * SLOPE_NOISE, by_curvature).clamp_(max=0.5 * equations.noise**2)
+    expected = torch.minimum(residual_variance * SLOPE_NOISE, by_curvature)
     energy = windows.reduced(equations.slope * equations.slope)
     mean_slope = mean(equations.mean_slope)
     texture = mean(energy).addcmul_(mean_slope, mean_slope, value=-1)

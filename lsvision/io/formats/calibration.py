@@ -10,6 +10,7 @@ from torch import Tensor
 
 from lsvision.errors import FileFormatError
 from lsvision.io.formats.installation import installation_to_dict
+from lsvision.io.formats.raw_rig import RawRigEntries, raw_rig_to_dict
 from lsvision.io.formats.rig import RigEntries, rig_to_dict
 from lsvision.io.formats.validation import Matrix, Triple, read_entries, read_json
 from lsvision.io.json_file import write_json
@@ -129,6 +130,7 @@ class CalibrationEntries(Checked):
     observability: ObservabilityEntries
     rig: RigEntries
     provenance: ProvenanceEntries
+    raw_rig: RawRigEntries | None = None
     verdict: Verdict | None = None
     reasons: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
@@ -168,6 +170,7 @@ def write_calibration(calibration: Calibration, path: Path | str) -> None:
         },
         "installation": installation_to_dict(calibration.installation),
         "rig": rig_to_dict(calibration.rig),
+        **({} if calibration.raw_rig is None else {"raw_rig": raw_rig_to_dict(calibration.raw_rig)}),
         "provenance": {
             "version": provenance.version,
             "config_sha256": provenance.config_sha256,
@@ -201,6 +204,7 @@ def read_calibration(path: Path | str) -> Calibration:
         boards=tuple(board.fit() for board in entries.boards),
         observability=observability,
         rig=entries.rig.rig(),
+        raw_rig=None if entries.raw_rig is None else entries.raw_rig.rig(),
         provenance=Provenance(
             version=entries.provenance.version,
             config_sha256=entries.provenance.config_sha256,

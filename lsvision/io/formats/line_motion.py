@@ -23,7 +23,7 @@ from lsvision.io.atomic import partial_file
 from lsvision.io.formats.validation import on_one_line, read_bytes, read_entries
 from lsvision.io.json_file import json_text
 from lsvision.schema import near_hint
-from lsvision.types import LINE_COMPONENTS, LineFinding, LineMotion, Travel
+from lsvision.types import LINE_COMPONENTS, LineFinding, LineMotion, SectionFit, Travel
 
 if TYPE_CHECKING:
     import polars
@@ -35,7 +35,7 @@ _PAIRS = {
     for i, j in combinations(range(len(LINE_COMPONENTS)), 2)
 }
 _COLUMNS = ("line", *VALUE_COLUMNS, *SIGMA_COLUMNS, *_PAIRS)
-_FINDINGS = "lsvision.findings"  # key of the file's metadata
+_FINDINGS, _SECTION = "lsvision.findings", "lsvision.section"  # keys of the file's metadata
 
 _MOST_BYTES = 1 << 28  # a million lines with all columns
 _LARGEST = {"dx_mm": 100.0, "dz_mm": 100.0, "roll_rad": 0.5}  # beyond it is a distance, or an angle in degrees
@@ -55,9 +55,11 @@ def write_line_motion(motion: LineMotion, path: Path | str) -> None:
         columns[name] = torch.where(scale > 0, motion.covariance[:, i, j] / scale, 0.0).clamp(-1, 1)
     always = ("line", *VALUE_COLUMNS)
     kept = {name: values.numpy() for name, values in columns.items() if name in always or bool(values.any())}
-    found = json_text([asdict(finding) for finding in motion.findings])
+    found = {_FINDINGS: json_text([asdict(finding) for finding in motion.findings])} if motion.findings else {}
+    if motion.section is not None:
+        found[_SECTION] = json_text(asdict(motion.section))
     with partial_file(path) as partial:
-        polars.DataFrame(kept).write_parquet(partial, metadata={_FINDINGS: found} if motion.findings else None)
+        polars.DataFrame(kept).write_parquet(partial, metadata=found or None)
 
 
 def read_line_motion(path: Path | str, lines: int, travel: Travel | None = None) -> LineMotion:
@@ -72,6 +74,7 @@ def read_line_motion(path: Path | str, lines: int, travel: Travel | None = None)
     """
     path = Path(path)
     columns, found = _read_table(path, lines)
+    section = _section(path, found.get(_SECTION))
     if not torch.equal(columns["line"], torch.arange(lines, dtype=torch.float64)):
         off = int((columns["line"] != torch.arange(lines)).nonzero()[0, 0])
         raise FileFormatError(path, f"expected every line in order, got {columns['line'][off]:g} in row {off}", "line")
@@ -80,7 +83,7 @@ def read_line_motion(path: Path | str, lines: int, travel: Travel | None = None)
     values = torch.stack([columns.get(name, none) for name in VALUE_COLUMNS], dim=1)
     sigma = torch.stack([columns.get(name, none) for name in SIGMA_COLUMNS], dim=1)
     covariance = sigma[:, :, None] * sigma[:, None, :] * _correlations(path, columns, lines)
-    motion = LineMotion(values, covariance, _findings(path, found, columns))
+    motion = LineMotion(values, covariance, _findings(path, found.get(_FINDINGS), columns), section)
     if travel is not None:
         try:
             uneven_travel(travel, motion)
@@ -89,14 +92,14 @@ def read_line_motion(path: Path | str, lines: int, travel: Travel | None = None)
     return motion
 
 
-def _read_table(path: Path, lines: int) -> tuple[dict[str, Tensor], str | None]:
-    """The columns, float64, of a file with so many rows, and its findings as text."""
+def _read_table(path: Path, lines: int) -> tuple[dict[str, Tensor], Mapping[str, str]]:
+    """The columns, float64, of a file with so many rows, and its metadata."""
     import polars
 
     stream = io.BytesIO(read_bytes(path, _MOST_BYTES))
     try:
         schema = polars.read_parquet_schema(stream)
-        found = polars.read_parquet_metadata(stream).get(_FINDINGS)
+        found = polars.read_parquet_metadata(stream)
         rows = polars.scan_parquet(stream).select(polars.len()).collect().item()
     except (Exception, polars.exceptions.PanicException) as error:  # a damaged file surfaces as any of a dozen types
         raise FileFormatError(path, f"expected Parquet: {on_one_line(error)}") from error
@@ -164,15 +167,24 @@ def _findings(path: Path, text: str | None, columns: dict[str, Tensor]) -> tuple
     """What the file says about its components, else what its values say."""
     if text is None:
         return tuple(_given(index, columns) for index in range(len(LINE_COMPONENTS)))
-    try:
-        entries = json.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise FileFormatError(path, f"expected JSON: {on_one_line(error)}", _FINDINGS) from error
+    entries = _from_json(path, text, _FINDINGS)
     if not isinstance(entries, list) or len(entries) > len(LINE_COMPONENTS):
         raise FileFormatError(path, "expected a list with one entry for each component", _FINDINGS)
     found = tuple(read_entries(LineFinding, entry, path, f"{_FINDINGS}[{i}]") for i, entry in enumerate(entries))
     _check_findings(path, found, columns)
     return found
+
+
+def _section(path: Path, text: str | None) -> SectionFit | None:
+    """Where the file says that the section lies."""
+    return None if text is None else read_entries(SectionFit, _from_json(path, text, _SECTION), path, _SECTION)
+
+
+def _from_json(path: Path, text: str, key: str) -> Any:
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise FileFormatError(path, f"expected JSON: {on_one_line(error)}", key) from error
 
 
 def _check_findings(path: Path, findings: Iterable[LineFinding], columns: dict[str, Tensor]) -> None:

@@ -6,18 +6,20 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Literal
 
+import torch
 import yaml
 
 from lsvision.errors import FileFormatError
 from lsvision.geometry import ideal_rig
 from lsvision.io.atomic import write_text
-from lsvision.io.formats.rig import RIG_FORMAT, ColorSpacing, ResponseFiles, RigEntries
+from lsvision.io.formats.rig import RIG_FORMAT, PairEntries, RigEntries, spacing_to_dict
 from lsvision.io.formats.validation import read_entries, read_yaml
-from lsvision.schema import AcuteAngle, Checked, NonNegative, Positive, PositiveInt, shown
+from lsvision.schema import AcuteAngle, Checked, NonNegative, Positive, shown
 from lsvision.types import RIG_QUANTITIES, RawCamera, RawRig, Rig, ViewPlane
 
 RawRigFormat = Literal["lsvision-rig/2"]
 RAW_RIG_FORMAT: RawRigFormat = "lsvision-rig/2"
+_ROUNDING = 1e-6  # of a correlation
 
 
 @dataclass(frozen=True)
@@ -42,28 +44,29 @@ class RightCameraEntries(RawCameraEntries):
     view_plane: ViewPlane = field(default_factory=ViewPlane)
 
 
-@dataclass(frozen=True)
-class RawRigEntries(Checked):
-    """The entries of ``rig.yaml``; ``sigma`` holds what is known of the quantities named in ``RIG_QUANTITIES``."""
+@dataclass(frozen=True, kw_only=True)
+class RawRigEntries(PairEntries):
+    """The entries of ``rig.yaml``; ``sigma`` holds what is known of the quantities named in ``RIG_QUANTITIES``.
+
+    ``covariance`` is that of all of them, in their order and units, and replaces ``sigma`` where it is given.
+    """
 
     format: RawRigFormat
-    width_px: PositiveInt
-    pixel_pitch_um: Positive
-    baseline_mm: Positive
     left: RawCameraEntries
     right: RightCameraEntries
-    color_spacing_lines: ColorSpacing | None = None
     sigma: dict[str, NonNegative] | None = None
-    response: ResponseFiles | None = None
+    covariance: tuple[tuple[float, ...], ...] | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
         for name in sorted(set(self.sigma or {}) - set(RIG_QUANTITIES)):
             raise self.fault(f"sigma.{name}", f"unknown key; the quantities are {', '.join(RIG_QUANTITIES)}")
+        problem = None if self.covariance is None else _covariance_problem(self.covariance)
+        if problem:
+            raise self.fault("covariance", problem)
 
     def rig(self) -> RawRig:
         """The rig that they describe."""
-        spacing = self.color_spacing_lines or ColorSpacing(0.0, 0.0, 0.0)
         return RawRig(
             width_px=self.width_px,
             pixel_pitch_um=self.pixel_pitch_um,
@@ -71,9 +74,26 @@ class RawRigEntries(Checked):
             left=self.left.camera(),
             right=self.right.camera(),
             view_plane=self.right.view_plane,
-            color_spacing_lines=(spacing.red, spacing.green, spacing.blue),
+            color_spacing_lines=self.spacing,
             sigma=tuple(sorted((self.sigma or {}).items())),
+            covariance=self.covariance,
         )
+
+
+def _covariance_problem(rows: tuple[tuple[float, ...], ...]) -> str | None:
+    """What keeps rows from being a covariance of all quantities."""
+    size = len(RIG_QUANTITIES)
+    if len(rows) != size or any(len(row) != size for row in rows):
+        return f"expected {size} rows of {size} numbers"
+    matrix = torch.tensor(rows, dtype=torch.float64)
+    scale = matrix.diagonal().clamp(min=0).sqrt()
+    if bool((matrix - matrix.mT).abs().gt(_ROUNDING * torch.outer(scale, scale)).any()):
+        return "expected a symmetric matrix"
+    known = scale > 0
+    correlation = (matrix / torch.outer(scale, scale))[known][:, known]
+    if bool((matrix.diagonal() < 0).any()) or float(torch.linalg.eigvalsh(correlation)[:1].sum()) < -_ROUNDING:
+        return "expected a positive semidefinite matrix"
+    return None
 
 
 @dataclass(frozen=True)
@@ -142,7 +162,6 @@ def raw_rig_to_dict(rig: RawRig) -> dict[str, object]:
         }
         for camera in (rig.left, rig.right)
     )
-    spacing = {"color_spacing_lines": asdict(ColorSpacing(*rig.color_spacing_lines))}
     return {
         "format": RAW_RIG_FORMAT,
         "width_px": rig.width_px,
@@ -150,8 +169,9 @@ def raw_rig_to_dict(rig: RawRig) -> dict[str, object]:
         "baseline_mm": rig.baseline_mm,
         "left": left,
         "right": {**right, "view_plane": asdict(rig.view_plane)},
-        **(spacing if any(rig.color_spacing_lines) else {}),
+        **spacing_to_dict(rig.color_spacing_lines),
         **({"sigma": dict(rig.sigma)} if rig.sigma else {}),
+        **({"covariance": [list(row) for row in rig.covariance]} if rig.covariance else {}),
     }
 
 

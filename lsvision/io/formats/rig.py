@@ -52,22 +52,33 @@ class ResponseFiles(Checked):
         return {camera: name for camera, name in asdict(self).items() if name is not None}
 
 
-@dataclass(frozen=True)
-class RigEntries(Checked):
-    """The entries of ``rig.yaml``."""
+@dataclass(frozen=True, kw_only=True)
+class PairEntries(Checked):
+    """The entries of any pair of line cameras."""
 
-    format: RigFormat
     width_px: PositiveInt
     pixel_pitch_um: Positive
-    focal_length_mm: Positive
     baseline_mm: Positive
-    principal_point_px: PrincipalPoints
     color_spacing_lines: ColorSpacing | None = None
     response: ResponseFiles | None = None
 
+    @property
+    def spacing(self) -> tuple[float, float, float]:
+        """Colour spacing of red, green and blue, lines."""
+        spacing = self.color_spacing_lines
+        return (0.0, 0.0, 0.0) if spacing is None else (spacing.red, spacing.green, spacing.blue)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RigEntries(PairEntries):
+    """The entries of ``rig.yaml``."""
+
+    format: RigFormat
+    focal_length_mm: Positive
+    principal_point_px: PrincipalPoints
+
     def rig(self) -> Rig:
         """The rig that they describe."""
-        spacing = self.color_spacing_lines or ColorSpacing(0.0, 0.0, 0.0)
         return Rig(
             width_px=self.width_px,
             pixel_pitch_um=self.pixel_pitch_um,
@@ -75,7 +86,7 @@ class RigEntries(Checked):
             baseline_mm=self.baseline_mm,
             principal_left_px=self.principal_point_px.left,
             principal_right_px=self.principal_point_px.right,
-            color_spacing_lines=(spacing.red, spacing.green, spacing.blue),
+            color_spacing_lines=self.spacing,
         )
 
 
@@ -96,16 +107,20 @@ def write_rig(rig: Rig, path: Path | str) -> None:
 
 def rig_to_dict(rig: Rig) -> dict[str, object]:
     """Plain data of a rig, as ``rig.yaml`` holds it; the colour spacing only where there is one."""
-    entries = RigEntries(
-        format=RIG_FORMAT,
-        width_px=rig.width_px,
-        pixel_pitch_um=rig.pixel_pitch_um,
-        focal_length_mm=rig.focal_length_mm,
-        baseline_mm=rig.baseline_mm,
-        principal_point_px=PrincipalPoints(rig.principal_left_px, rig.principal_right_px),
-        color_spacing_lines=ColorSpacing(*rig.color_spacing_lines) if any(rig.color_spacing_lines) else None,
-    )
-    return {key: value for key, value in asdict(entries).items() if value is not None}
+    return {
+        "format": RIG_FORMAT,
+        "width_px": rig.width_px,
+        "pixel_pitch_um": rig.pixel_pitch_um,
+        "focal_length_mm": rig.focal_length_mm,
+        "baseline_mm": rig.baseline_mm,
+        "principal_point_px": asdict(PrincipalPoints(rig.principal_left_px, rig.principal_right_px)),
+        **spacing_to_dict(rig.color_spacing_lines),
+    }
+
+
+def spacing_to_dict(color_spacing_lines: tuple[float, float, float]) -> dict[str, object]:
+    """Entry ``color_spacing_lines``; none where all colours see the same line."""
+    return {"color_spacing_lines": asdict(ColorSpacing(*color_spacing_lines))} if any(color_spacing_lines) else {}
 
 
 def rig_from_dict(data: object, path: Path, where: str = "") -> Rig:

@@ -25,6 +25,7 @@ def write_rig_calibration(calibration: RigCalibration, path: Path | str) -> None
         "reasons": list(calibration.reasons),
         "advice": calibration.advice,
         "noise_scale": calibration.noise_scale,
+        "errors_along_scan": [asdict(item) for item in calibration.errors_along_scan],
         "height_error_um": calibration.height_error_um,
         "rig": raw_rig_to_dict(calibration.rig),
         "motion": motion_to_dict(calibration.motion),

@@ -21,6 +21,7 @@ from lsvision.stages.calibration.measurements import BoardMeasurements
 from lsvision.stages.calibration.misplaced import column_rows, largest_residuals
 from lsvision.stages.calibration.noise import board_chi_square
 from lsvision.stages.calibration.observability import Known, observe
+from lsvision.stages.calibration.rig_errors import motion_by_rig, widened_by_rig
 from lsvision.stages.calibration.solved import Solution, solve
 from lsvision.stages.calibration.verdict import UNLIKE, judge, not_settled, rmse_grew
 from lsvision.stages.calibration.with_edges import with_edges
@@ -56,7 +57,8 @@ def calibrate(
             f"{', '.join(board.scan for board in boards)}: the corners do not determine the boards' poses"
         )
     depth_mm = config.depth_range_mm or sharp_depth_mm(rig)
-    known = Known(batch.covariance, config.prior_sigma, scale, depth_mm)
+    covariance, by_rig = widened_by_rig(batch.covariance, motion_by_rig(boards, solution, config))
+    known = Known(covariance, config.prior_sigma, scale, depth_mm)
     observability = observe(solution.weighed, solution.posterior.mean, known)
     iterations, converged = iterations_of(batch), bool(batch.converged)
     before_mm, after_mm = iterations[0].rmse_mm, iterations[-1].rmse_mm
@@ -71,7 +73,7 @@ def calibrate(
     judged = judge(not_settled(converged, int(batch.iterations)), contradictions, observability)
     return Calibration(
         method=config.method,
-        motion=Motion(batch.n, batch.covariance),
+        motion=Motion(batch.n, covariance),
         rmse_before_mm=before_mm,
         rmse_after_mm=after_mm,
         iterations=iterations,
@@ -81,7 +83,7 @@ def calibrate(
         rig=rig,
         verdict=judged.verdict,
         reasons=judged.reasons,
-        notes=(*findings.notes, *(found.by_edges if along_scan else findings.shake)),
+        notes=(*findings.notes, *by_rig, *(found.by_edges if along_scan else findings.shake)),
         converged=converged,
         noise_scale=scale,
         errors_along_scan=along_scan,

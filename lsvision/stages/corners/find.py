@@ -19,6 +19,7 @@ from lsvision.geometry import (
 from lsvision.image.board.detect import SeenBoard, locate_corners, look_for_board
 from lsvision.image.board.refine import DetectedCorners
 from lsvision.image.planes import fit_local_planes
+from lsvision.stages.corners.by_rig import points_by_rig
 from lsvision.stages.corners.config import CornersConfig
 from lsvision.stages.corners.ideal import IdealCorners
 from lsvision.stages.corners.pairing import pair_lattices
@@ -35,6 +36,7 @@ class _Measured:
     valid: Tensor
     left_px: Tensor
     right_px: Tensor | None = None
+    by_rig: Tensor | None = None
 
 
 @dataclass(frozen=True)
@@ -110,6 +112,7 @@ def measure_corners(
         left_px=measured.left_px,
         right_px=measured.right_px,
         travel_mm=travel_at(scan.travel, torch.arange(scan.lines, dtype=torch.float64)),
+        by_rig=None if measured.by_rig is None else torch.where(valid[:, None, None], measured.by_rig, torch.nan),
     )
 
 
@@ -165,7 +168,9 @@ def _triangulated(
     covariance = by_left @ left.covariance @ by_left.mT + by_right @ right.covariance @ by_right.mT
     mixed = by_left @ left.covariance_with(right) @ by_right.mT
     covariance = covariance + mixed + mixed.mT
-    return _Measured(points, covariance, valid & torch.isfinite(points).all(-1), ideal.left, ideal.right)
+    n = points.new_tensor([0.0, 1.0, 0.0]) if rectification is None else rectification.n
+    by_rig = points_by_rig(scan, left.position, right.position, weight, n)
+    return _Measured(points, covariance, valid & torch.isfinite(points).all(-1), ideal.left, ideal.right, by_rig)
 
 
 def _lines_out_of_step(ideal: IdealCorners, seen: Tensor) -> float:

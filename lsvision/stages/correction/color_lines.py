@@ -1,7 +1,7 @@
 """Where the colours of a surface were taken: red, green and blue of a trilinear sensor look at different lines.
 
-The depth of a scan is that of its green lines. Another colour, which looks at the plane Y = s, sees the same point
-s / n2 of travel later and in another column (``ProductFrame.shifted_column``).
+The depth of a scan is that of its green lines. Another colour, which looks at the plane Y = s z / z0, sees the same
+point Y / n2 of travel later and in another column (``ProductFrame.plane_y``, ``shifted_column``).
 """
 
 import math
@@ -20,6 +20,7 @@ from lsvision.stages.correction.config import CorrectionConfig
 from lsvision.stages.correction.locate import SeenCells
 from lsvision.types import Scan
 
+_NEARER = 0.1  # of z0: how much nearer or further than it surfaces may lie, at most
 _COARSE_FROM = 1.25  # distance of cells, in pixels, from which on smoothing does more good than harm
 
 
@@ -31,8 +32,9 @@ class ColorLines:
         start: the first of the lines.
         image_range: the lines of the image that ``sample`` needs, first and end.
         sampling: how they are interpolated.
-        shift_mm: where each colour looks along Y, beyond green. rows: ``(channels, lines)``, float64: the image row in
-            which a colour shows what green shows on each line. Both are None where all colours look at one line.
+        shift_mm: where each colour looks along Y at z0, beyond green. rows: ``(channels, lines)``, float64: the image
+            row in which a colour shows what green shows at z0 on each line. Both are None where all colours look at
+            one line.
         registered: rows by which the camera has shifted each colour: row less ``registered`` is the line that it was
             taken on.
         raw_columns: where the columns of the ideal left image, in which cells are located, lie in the raw one; None
@@ -62,13 +64,15 @@ class ColorLines:
         begin = seen.first_line - self.start
         base = seen.line.nan_to_num().floor().clamp(-begin, self.rows.shape[1] - 2 - begin)
         part, base = (seen.line - base).double(), base.long() + begin
-        column, relief = seen.column.double(), seen.relief.double()
-        line = seen.line.double() + seen.first_line
+        column, line = seen.column.double(), seen.line.double() + seen.first_line
+        z = self.frame.depth(column, seen.relief.double(), line)
         for channel, (shift_mm, rows) in enumerate(zip(self.shift_mm, self.rows - self.image_range[0], strict=True)):
-            row, into = torch.lerp(rows[base], rows[base + 1], part), torch.empty_like(out[..., :1])
-            taken = row + (self.image_range[0] - self.registered[channel])
-            shifted = self.in_image(self.frame.shifted_column(column, relief, shift_mm, (line, taken)))
-            sample_image(image[..., [channel]], shifted, row, self.sampling, out=into)
+            row, seen_at, into = torch.lerp(rows[base], rows[base + 1], part), column, torch.empty_like(out[..., :1])
+            if shift_mm != 0:
+                moved_mm, beside = self.frame.plane_y(shift_mm, z), self.image_range[0] - self.registered[channel]
+                taken = line + (row + beside - line) * (moved_mm / shift_mm)
+                row, seen_at = taken - beside, self.frame.shifted_column(column, z, moved_mm, (line, taken))
+            sample_image(image[..., [channel]], self.in_image(seen_at), row, self.sampling, out=into)
             out[..., [channel]] = into
 
     def in_image(self, column: Tensor) -> Tensor:
@@ -92,10 +96,12 @@ def color_lines(scan: Scan, frame: ProductFrame, lines: tuple[int, int], samplin
         image_range = max(lines[0] - reach, 0), min(lines[1] + reach, scan.lines)
         return ColorLines(frame, lines[0], image_range, sampling, raw_columns=raw_columns)
     shift_mm, rows = shift * scan.travel.line_pitch_mm, color_rows(scan, frame, lines, shift)
-    registered = registered_rows(scan, shift).tolist()
-    first, last = math.floor(float(rows.min())) - reach, math.ceil(float(rows.max())) + reach + 1
+    registered = registered_rows(scan, shift)
+    beside = _beside(rows, torch.arange(*lines), registered)
+    first = math.floor(float((rows - beside).min())) - reach
+    last = math.ceil(float((rows + beside).max())) + reach + 1
     image_range = min(max(first, 0), scan.lines - 1), max(min(last, scan.lines), 1)
-    return ColorLines(frame, lines[0], image_range, sampling, shift_mm, rows, registered, raw_columns)
+    return ColorLines(frame, lines[0], image_range, sampling, shift_mm, rows, registered.tolist(), raw_columns)
 
 
 def lines_without_colors(scan: Scan, frame: ProductFrame, sampling: Sampling) -> Bool[Tensor, " lines"]:
@@ -105,5 +111,12 @@ def lines_without_colors(scan: Scan, frame: ProductFrame, sampling: Sampling) ->
     if shift is None:
         return near
     rows = color_rows(scan, frame, (0, scan.lines), shift)
-    lower, upper = (row.long().clamp(0, scan.lines - 1) for row in (rows.floor(), rows.ceil()))
+    beside = _beside(rows, lines, registered_rows(scan, shift))
+    ends = (rows - beside).floor(), (rows + beside).ceil()
+    lower, upper = (row.long().clamp(0, scan.lines - 1) for row in ends)
     return (near[lower] | near[upper]).any(0)
+
+
+def _beside(rows: Tensor, lines: Tensor, registered: Tensor) -> Tensor:
+    """Rows by which what a colour shows of surfaces nearer or further than z0 may lie beside ``rows``, at most."""
+    return _NEARER * (rows - registered[:, None] - lines).abs()

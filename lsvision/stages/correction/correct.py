@@ -19,8 +19,9 @@ from lsvision.stages.correction.config import CorrectionConfig
 from lsvision.stages.correction.grid import plan_product, source_dtype
 from lsvision.stages.correction.locate import Locator, SeenCells, cell_spacing
 from lsvision.stages.correction.profiles import DepthWithoutLines, ProfileReader, ProfileRule
+from lsvision.stages.correction.rig_errors import RigErrors
 from lsvision.stages.correction.uncertainty import position_sigma
-from lsvision.types import DepthSource, LineMotion, Motion, ProductGrid, ProductStrip, Scan, missing_ranges
+from lsvision.types import DepthSource, LineMotion, Motion, ProductGrid, ProductStrip, Rig, Scan, missing_ranges
 
 # Lines under a tile, of the 8192 over which ``PIXEL_PARTS`` are exact: slope and relief of the object add to them.
 _TILE_LINES = 4096
@@ -44,6 +45,17 @@ def correct_scan(
     correction = Correction(scan, depth, motion, config, grid or plan_product(scan, motion, config), line_motion)
     for row in range(0, correction.grid.rows, config.strip_rows):
         yield correction.strip((row, min(row + config.strip_rows, correction.grid.rows)))
+
+
+def z_range_of(rig: Rig, config: CorrectionConfig) -> tuple[float, float]:
+    """Depths, mm, that the heights of a product lie between."""
+    z0, (low, high) = zero_disparity_mm(rig), config.height_range_mm
+    return z0 - high, z0 - low
+
+
+def rig_errors_of(scan: Scan, motion: Motion, config: CorrectionConfig) -> RigErrors | None:
+    """What is not known of a scan's raw rig, in the heights of its product; None where that counts as exact."""
+    return RigErrors.of(scan.raw_rig, scan.rig, motion.n, z_range_of(scan.rig, config))
 
 
 @dataclass(frozen=True)
@@ -70,17 +82,21 @@ class Correction:
     @cached_property
     def locator(self) -> Locator:
         """Finds what the cells of the product see."""
-        z0, (low, high) = zero_disparity_mm(self.scan.rig), self.config.height_range_mm
         rule = ProfileRule(
             columns=self.grid.columns,
             pitch_mm=self.grid.pitch_mm,
             origin_x_mm=self.grid.origin_x_mm,
-            z_range_mm=(z0 - high, z0 - low),
+            z_range_mm=z_range_of(self.scan.rig, self.config),
             largest_step_mm=depth_step_mm(self.scan.rig, self.config.step_px),
             bridge_px=self.config.bridge_px,
         )
         profiles = ProfileReader(self._shown_depth, self.frame, rule, with_sigma=self.config.uncertainty)
         return Locator(self.frame, self.grid, self.config, profiles)
+
+    @cached_property
+    def rig_errors(self) -> RigErrors | None:
+        """What is not known of a raw rig, in heights."""
+        return rig_errors_of(self.scan, self.motion, self.config)
 
     def strip(self, rows: tuple[int, int]) -> ProductStrip:
         """Rows ``rows[0]..rows[1]-1`` of the product."""
@@ -135,7 +151,10 @@ class Correction:
         sigma, z = seen.depth_sigma, self.frame.depth(column, seen.relief.double(), line)
         if sigma is None:
             sigma = depth_sigma(self.scan.rig, z, self.config.disparity_sigma_px)
-        return position_sigma(self.frame, self.motion.covariance, column, line, sigma, z)
+        found = position_sigma(self.frame, self.motion.covariance, column, line, sigma, z)
+        if self.rig_errors is not None:
+            found[..., 2] = found[..., 2].hypot(self.rig_errors.sigma_mm(column, z))
+        return found
 
     def _empty_strip(self, rows: tuple[int, int]) -> ProductStrip:
         shape, left = (rows[1] - rows[0], self.grid.columns), self.scan.left

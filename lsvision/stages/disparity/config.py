@@ -53,7 +53,7 @@ class DisparityConfig(Checked):
     ``fine_check_px`` that of the finer search. Patches of disparity smaller than ``speckle_px`` are removed.
     ``refine_iterations`` of local least squares over a window of ``refine_window`` px follow; 0 leaves the sixteenths
     of a pixel of ``sgbm``, which lean towards whole ones. A pixel whose sigma then exceeds ``largest_sigma_px`` is
-    dropped where its match explains none of the grey values around it, and where it exceeds 7.25 times as much however
+    dropped where its match explains none of the grey values around it, and where it exceeds 7 times as much however
     much its match explains, with limits between for shares between: how often a disparity is wrong depends on both. Of
     the pixels kept on rendered rails 1 in 1800 is wrong by more than a pixel. Infinity keeps all. A pixel is dropped,
     too, unless the slopes of the grey values around it exceed those of noise by ``texture_confidence`` standard

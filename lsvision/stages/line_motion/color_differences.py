@@ -68,8 +68,8 @@ def measure_color_differences(
         samples = LineSamples.of(block, pair.frame, config.height_range_mm, whole)
         for part in samples.split(_AT_ONCE):
             values = lines.values[start : start + len(part.z)]
-            for parts, channel, shift_mm in zip(colors, pair.channels, pair.shift_mm, strict=True):
-                seen = replace(part, plane_y_mm=shift_mm)
+            for parts, channel, slope in zip(colors, pair.channels, pair.plane_slopes, strict=True):
+                seen = replace(part, plane_slope=slope)
                 parts.append(register_color(pair, channel, start, seen, values, (reference, config.cut_sigma)))
             start += len(part.z)
     least = config.min_share * lines.samples.double().median()

@@ -7,9 +7,17 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from lsvision.geometry import ProductFrame, Rectification, color_rows, color_shift
+from lsvision.geometry import ProductFrame, Rectification, color_shift, registered_rows, zero_disparity_mm
 from lsvision.image.stereo.relation import PairRelation
 from lsvision.types import LineImage, Scan, StereoPair
+
+
+@dataclass(frozen=True)
+class ObjectDepth:
+    """How far away the object is: ``lines_mm`` its middle on every line, ``beside_mm`` columns beyond the middle."""
+
+    lines_mm: Float[Tensor, " lines"]
+    beside_mm: Float[Tensor, " columns"]
 
 
 @dataclass(frozen=True)
@@ -19,7 +27,8 @@ class ColorPair:
     Attributes:
         relation: of the scan's two images.
         channels: of the colour that sees a piece of the object last, and of the one that sees it first.
-        shift: lines by which each colour looks beyond green, by channel.
+        shift: lines by which each colour looks beyond green at z0, by channel.
+        depth: of the object, which the colours' lines look the further apart on the further away it is.
     """
 
     scan: Scan
@@ -28,20 +37,27 @@ class ColorPair:
     relation: PairRelation
     channels: tuple[int, int]
     shift: Float[Tensor, " channels"]
+    depth: ObjectDepth
 
     @property
     def shift_mm(self) -> Sequence[float]:
-        """Where along Y the two colours look, beyond green."""
+        """Where along Y at z0 the two colours look, beyond green."""
         return [float(self.shift[channel]) * self.scan.travel.line_pitch_mm for channel in self.channels]
 
+    @property
+    def plane_slopes(self) -> Sequence[float]:
+        """Y of where the two colours look, per mm of depth."""
+        return [shift / zero_disparity_mm(self.frame.rig) for shift in self.shift_mm]
+
     def taken(self) -> Float[Tensor, "2 lines"]:
-        """The (fractional) lines on which the two colours saw what green saw on each line."""
+        """The (fractional) lines on which the two colours saw what green saw on each line, at the depth of the line."""
         shift_mm = torch.tensor(self.shift_mm, dtype=torch.float64)
-        return self.frame.shifted_line(torch.arange(self.scan.lines, dtype=torch.float64), shift_mm[:, None])
+        seen_at = self.frame.plane_y(shift_mm[:, None], self.depth.lines_mm)
+        return self.frame.shifted_line(torch.arange(self.scan.lines, dtype=torch.float64), seen_at)
 
     def rows(self) -> Float[Tensor, "2 lines"]:
         """The (fractional) rows of the images that show it in the two colours."""
-        return color_rows(self.scan, self.frame, (0, self.scan.lines), self.shift)[list(self.channels)]
+        return self.taken() + registered_rows(self.scan, self.shift)[list(self.channels), None]
 
     def left(self, channel: int, start: int, stop: int) -> Float[Tensor, "rows width"]:
         """One colour of some rows of the left image, of 255."""
@@ -57,7 +73,7 @@ class ColorPair:
         return 255.0 / self.relation.levels.white
 
 
-def color_pair(scan: Scan, frame: ProductFrame, relation: PairRelation | None) -> ColorPair | None:
+def color_pair(scan: Scan, frame: ProductFrame, relation: PairRelation | None, depth: ObjectDepth) -> ColorPair | None:
     """The two colours of a scan that look furthest apart; None where all look at one line, or nothing was matched.
 
     Nor are there any of a raw pair: its images show a column of the ideal pair elsewhere, and at another moment.
@@ -70,7 +86,7 @@ def color_pair(scan: Scan, frame: ProductFrame, relation: PairRelation | None) -
     channels = int(shift.argmin()), int(shift.argmax())
     if scan.travel.transport == "reverse":
         channels = channels[::-1]
-    return ColorPair(scan, scan.images, frame, relation, channels, shift)
+    return ColorPair(scan, scan.images, frame, relation, channels, shift, depth)
 
 
 def at_rows(values: Float[Tensor, "rows ..."], row: Float[Tensor, " lines"]) -> Float[Tensor, "lines ..."]:

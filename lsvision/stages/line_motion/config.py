@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from lsvision.schema import Checked, Interval, IntFrom2, NonNegative, Positive, PositiveInt, Share
+from lsvision.schema import Checked, Interval, IntFrom2, NonNegative, Positive, PositiveInt, Share, Text
 
 
 @dataclass(frozen=True)
@@ -15,6 +15,10 @@ class LineMotionConfig(Checked):
     less the further it lies off, and not at all beyond ``cut_sigma`` of its standard deviations: defects are outliers.
     Of the columns at most ``samples`` are used, as neighbours err alike. A line of which less than ``min_share`` of the
     object's samples was measured is interpolated from the others; so are all lines of which too few are left.
+    ``reference`` is ``scan``; or a nominal section: ``EN60E1``, the head of the rail 60E1, or the path of a CSV with
+    the columns across_mm and height_mm. It is laid on the scan's own mean profile and takes its place, without its
+    noise, where at least half of that lies within ``section_within_mm`` of the section. What departs from it is added.
+    So it is known where the object lies in the product, how it is rolled there, and where it is worn.
     The errors of a line follow from what the registration leaves; ``common_error_px`` of disparity is what a line's
     depths err by all together besides (on rendered rails up to 0.005). ``expected_x_mm``, ``expected_z_mm`` and
     ``expected_roll_deg`` are the usual vibration (rms): they separate components that look alike on the profile, as
@@ -28,6 +32,8 @@ class LineMotionConfig(Checked):
     Lines are smoothed in blocks of ``block_lines`` with ``halo_lines`` on either side.
     """
 
+    reference: Text = "scan"
+    section_within_mm: Positive = 0.3
     height_range_mm: Interval = (-60.0, 60.0)
     profile_depth_mm: Positive = 40.0
     reference_lines: IntFrom2 = 512

@@ -9,24 +9,26 @@ lines of the colours, or a stated prior, separate them (``shape``).
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
-from lsvision.geometry import ProductFrame, color_shift, depth_step_mm, object_pitch_mm, travel_at
+from lsvision.geometry import ProductFrame, color_shift, depth_step_mm, middle_point, object_pitch_mm, travel_at
 from lsvision.stages.disparity.config import DisparityConfig
 from lsvision.stages.disparity.depth import relation_of_scan
 from lsvision.stages.line_motion.color_differences import measure_color_differences
-from lsvision.stages.line_motion.color_pair import ColorPair, color_pair
+from lsvision.stages.line_motion.color_pair import ColorPair, ObjectDepth, color_pair
 from lsvision.stages.line_motion.color_travel import ColorTravel, measure_color_travel, with_travel
 from lsvision.stages.line_motion.config import LineMotionConfig
 from lsvision.stages.line_motion.errors import ErrorSums, LineErrors
 from lsvision.stages.line_motion.estimate import estimate, noisy_values, not_measured
 from lsvision.stages.line_motion.profiles import LineSamples, Reference, columns_of, reference_profile
 from lsvision.stages.line_motion.register import Registered, equations_of, placed, register
+from lsvision.stages.line_motion.section import fit_section
 from lsvision.stages.line_motion.shape import ShapeData, without_shape
-from lsvision.types import Depth, DepthSource, LineMotion, Motion, Scan
+from lsvision.types import Depth, DepthSource, LineMotion, Motion, Scan, Section, SectionFit
 
 _WINDOWS = 8  # of neighbouring lines, that the reference of a long scan comes from
 _APART = 4  # lines of a window; neighbours err alike
@@ -37,50 +39,114 @@ _CROWN_SHARE, _CROWN_COLUMNS = 0.95, 512  # of the heights of a line: about its 
 _BELOW_MM = 5.0  # of the profile's depth, from where on samples take no part
 
 
-def measure_line_motion(scan: Scan, depth: DepthSource, motion: Motion, config: LineMotionConfig) -> LineMotion:
-    """Measure how every line of a scan is displaced and rolled, from its profile alone.
+@dataclass(frozen=True)
+class LineMeasurement:
+    """What lines show: the motion from line to line, and the travel by the colours; None where all look at one line."""
+
+    motion: LineMotion
+    travel: ColorTravel | None = None
+
+
+def measure_line_motion(
+    scan: Scan, depth: DepthSource, motion: Motion, config: LineMotionConfig, section: Section | None = None
+) -> LineMeasurement:
+    """Measure how every line of a scan is displaced and rolled, from its profile alone, and how far it advances.
 
     Args:
-        depth: of the left image. motion: n of the calibration.
+        depth: of the left image. motion: n of the calibration. section: that ``config.reference`` names.
 
     Returns:
-        What is not there or cannot be seen is zero, and ``findings`` says so.
+        What is not there or cannot be seen is zero, and ``findings`` of the motion says so.
+
+    Raises:
+        ValueError: ``config.reference`` names a section, and none is given.
     """
+    if (config.reference == "scan") != (section is None):
+        given = "none" if section is None else section.name
+        raise ValueError(f"section: expected the one of config.reference, {config.reference!r}, got {given}")
     frame = ProductFrame(scan.rig, scan.travel, motion.n)
     shown = _shown(frame, depth, config)
+    if shown is not None and section is not None:
+        shown = shown.on_section(section, config)
     if shown is None:
-        return not_measured(depth.lines, "no profile that half of the lines show was measured")
+        return LineMeasurement(not_measured(depth.lines, "no profile that half of the lines show was measured"))
     lines, sums = _registered(frame, depth, shown, config)
     errors = LineErrors.of(sums, depth_step_mm(scan.rig, config.common_error_px))
     along = travel_at(scan.travel, torch.arange(depth.lines).double())
-    found, pair = estimate(lines, shown.samples, along, errors, config), _colors(scan, frame)
+    found, valid = (
+        estimate(lines, shown.samples, along, errors, config),
+        noisy_values(lines, shown.samples, config).valid,
+    )
+    pair = _colors(scan, frame, shown.depth(lines.values[:, 1] * valid))
     if not found.is_still:
-        valid = noisy_values(lines, shown.samples, config).valid
         columns = shown.reference, shown.columns
         differences = None if pair is None else measure_color_differences(pair, depth, lines, columns, config)
         found = without_shape(found, ShapeData(lines, valid, along, errors, differences), config)
-    return found if pair is None else with_travel(found, measure_color_travel(pair, shown.columns), along)
+    travel = None if pair is None else measure_color_travel(pair, shown.columns)
+    found = found if travel is None else with_travel(found, travel, along)
+    return LineMeasurement(replace(found, section=_placed_section(shown, lines.values[valid], errors, frame)), travel)
 
 
 def measure_travel(scan: Scan, depth: DepthSource, motion: Motion, config: LineMotionConfig) -> ColorTravel | None:
     """How far the object advances from line to line, from the lines of the colours; None where all look at one line.
 
+    Lines are not registered for it: the object is taken at the mean depth of its profile.
+
     Args:
         depth: of the left image. motion: n of the calibration.
     """
+    if color_shift(scan) is None:
+        return None
     frame = ProductFrame(scan.rig, scan.travel, motion.n)
-    pair = _colors(scan, frame)
-    shown = None if pair is None else _shown(frame, depth, config)
-    return None if pair is None or shown is None else measure_color_travel(pair, shown.columns)
+    shown = _shown(frame, depth, config)
+    pair = None if shown is None else _colors(scan, frame, shown.depth(shown.z.new_zeros(depth.lines)))
+    return None if shown is None or pair is None else measure_color_travel(pair, shown.columns)
 
 
 @dataclass(frozen=True)
 class _Shown:
-    """The reference profile, the columns that show it, and how many samples of a line usually take part."""
+    """The reference profile, the columns that show it, and how many samples of a line usually take part.
+
+    ``z`` is the depth of every column from the first to the last.
+    """
 
     reference: Reference
     columns: slice
     samples: int
+    z: Float[Tensor, " columns"]
+    section: SectionFit | None = None
+
+    def depth(self, moved_mm: Float[Tensor, " lines"]) -> ObjectDepth:
+        """Of the object whose lines are displaced so far."""
+        middle = float(self.z.nanmean())
+        return ObjectDepth(middle + moved_mm, (self.z - middle).nan_to_num())
+
+    def on_section(self, section: Section, config: LineMotionConfig) -> "_Shown":
+        """With a section in place of the profile, where it is one of it."""
+        laid = fit_section(self.reference, section, config)
+        return self if laid is None else replace(self, reference=laid.reference, section=laid.fit)
+
+
+def _placed_section(
+    shown: _Shown, values: Float[Tensor, "lines 3"], errors: LineErrors, frame: ProductFrame
+) -> SectionFit | None:
+    """The section where it lies in the product, which shows lines at their mean displacement, not where it was laid."""
+    laid, beside = shown.section, float(frame.axes[0] @ middle_point(frame.rig))
+    if laid is None or not len(values):
+        return laid
+    dx, dz, roll = values.mean(0).tolist()
+    of_mean = errors.rms * ((1 + 2 * errors.memory) / len(values)).sqrt()
+    sigma = torch.hypot(of_mean, of_mean.new_tensor([laid.x_sigma_mm, laid.height_sigma_mm, laid.roll_sigma_rad]))
+    x_sigma, height_sigma, roll_sigma = sigma.tolist()
+    return replace(
+        laid,
+        x_mm=laid.x_mm + dx - roll * laid.height_mm,
+        height_mm=laid.height_mm - dz + roll * (laid.x_mm - beside),
+        roll_rad=laid.roll_rad + roll,
+        x_sigma_mm=x_sigma,
+        height_sigma_mm=height_sigma,
+        roll_sigma_rad=roll_sigma,
+    )
 
 
 def _shown(frame: ProductFrame, depth: DepthSource, config: LineMotionConfig) -> _Shown | None:
@@ -101,9 +167,10 @@ def _shown(frame: ProductFrame, depth: DepthSource, config: LineMotionConfig) ->
     reference, columns = _seen_along(placed(samples, values, frame), frame, config)
     if reference is None or columns is None:
         return None
+    z = (samples.z[:, columns.start : columns.stop] - values[:, 1, None]).nanmedian(0).values
     first = int(samples.columns[0])
     columns = slice(first + columns.start, first + columns.stop, columns.step)
-    return _Shown(reference, columns, int(found.samples.median()))
+    return _Shown(reference, columns, int(found.samples.median()), z)
 
 
 def _seen_along(
@@ -135,11 +202,11 @@ def _registered(
     return lines, ErrorSums.total(sums)
 
 
-def _colors(scan: Scan, frame: ProductFrame) -> ColorPair | None:
+def _colors(scan: Scan, frame: ProductFrame, depth: ObjectDepth) -> ColorPair | None:
     """The colours that look furthest apart; None where all colours look at one line."""
     if color_shift(scan) is None:
         return None
-    return color_pair(scan, frame, relation_of_scan(scan, DisparityConfig()))
+    return color_pair(scan, frame, relation_of_scan(scan, DisparityConfig()), depth)
 
 
 def _spread_lines(depth: DepthSource, count: int) -> Depth:

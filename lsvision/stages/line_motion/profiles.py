@@ -20,14 +20,15 @@ _SLOPE_REACH_MM = 0.4  # to either side of a place, over which the slope of a pr
 class LineSamples:
     """What some lines measured on some columns, float64: depth z and its standard deviation, mm, NaN where nothing.
 
-    ``slope`` is that of the columns' rays, and ``plane_y_mm`` where along Y they look, as lines of another colour do.
+    ``slope`` is that of the columns' rays, and ``plane_slope`` the Y of where they look per mm of depth: the lines of
+    another colour look along a plane of their own.
     """
 
     z: Float[Tensor, "lines columns"]
     sigma: Float[Tensor, "lines columns"]
     slope: Float[Tensor, " columns"]
     columns: Int[Tensor, " columns"]
-    plane_y_mm: float = 0.0
+    plane_slope: float = 0.0
 
     @classmethod
     def of(
@@ -45,7 +46,7 @@ class LineSamples:
     def on(self, columns: slice) -> "LineSamples":
         """Those of some columns."""
         parts = self.z[:, columns], self.sigma[:, columns], self.slope[columns], self.columns[columns]
-        return LineSamples(*parts, self.plane_y_mm)
+        return LineSamples(*parts, self.plane_slope)
 
     def among(self, seen: Bool[Tensor, "lines columns"]) -> "LineSamples":
         """Those ``seen``, on the columns between the first and the last that any line has."""
@@ -57,7 +58,7 @@ class LineSamples:
     def split(self, lines: int) -> "list[LineSamples]":
         """Those of some lines after the other."""
         parts = zip(self.z.split(lines), self.sigma.split(lines), strict=True)
-        return [LineSamples(z, sigma, self.slope, self.columns, self.plane_y_mm) for z, sigma in parts]
+        return [LineSamples(z, sigma, self.slope, self.columns, self.plane_slope) for z, sigma in parts]
 
 
 @dataclass(frozen=True)
@@ -97,7 +98,7 @@ def reference_profile(
     common = count >= len(q_x) / 2
     if not bool(common.any()):
         return None
-    reach = max(1, round(_SLOPE_REACH_MM / step_mm))
+    reach = _reach(step_mm)
     first = _median_by_node(node, level).masked_fill(~common, torch.nan)
     # Samples of a line at rest lie beside the nodes, always at the same places: the slope takes them there.
     beside = torch.zeros_like(first).index_add_(0, node, position - node) / count.clamp(min=1)
@@ -105,13 +106,23 @@ def reference_profile(
     moved = level - (slope.nan_to_num()[node] * (position - node)) * step_mm
     profile = _median_by_node(node, moved).masked_fill(~common, torch.nan)
     crown = float(profile.nan_to_num(-torch.inf).max())
-    profile = profile.masked_fill(~(profile >= crown - depth_mm), torch.nan)
-    slope = _slopes(profile, torch.arange(len(first)), reach, step_mm)
+    return reference_of(origin, step_mm, profile.masked_fill(~(profile >= crown - depth_mm), torch.nan))
+
+
+def reference_of(origin_mm: float, step_mm: float, height: Float[Tensor, " nodes"]) -> Reference | None:
+    """A reference of these heights; None where nothing shows a slope."""
+    reach = _reach(step_mm)
+    slope = _slopes(height, torch.arange(len(height)), reach, step_mm)
     slope = slope.masked_fill(slope.abs() > _STEEPEST, torch.nan)
     if not bool(slope.isfinite().any()):
         return None
     # A slope of noise would show sideways motion where a flat profile shows none.
-    return Reference(origin, step_mm, profile, slope.masked_fill(slope.abs() < _sloping(slope, reach), 0.0))
+    return Reference(origin_mm, step_mm, height, slope.masked_fill(slope.abs() < _sloping(slope, reach), 0.0))
+
+
+def _reach(step_mm: float) -> int:
+    """Nodes to either side that a slope takes."""
+    return max(1, round(_SLOPE_REACH_MM / step_mm))
 
 
 def _sloping(slope: Tensor, reach: int) -> float:

@@ -72,8 +72,9 @@ def placed(
     """(q_x, height), mm, of samples whose lines are displaced by ``values``."""
     axes = line_axes(frame.axes, pad(values, (0, 1)), middle_point(frame.rig))
     q_x, q_z = (
-        samples.z * (samples.slope * axes.across[:, i, None] + axes.ahead[:, i, None])
-        + (axes.origin[:, i, None] + samples.plane_y_mm * frame.axes[i, 1])
+        samples.z
+        * (samples.slope * axes.across[:, i, None] + axes.ahead[:, i, None] + samples.plane_slope * frame.axes[i, 1])
+        + axes.origin[:, i, None]
         for i in (0, 2)
     )
     return q_x, frame.height_datum_mm - q_z

@@ -1,18 +1,26 @@
 """Corners in both raw images of board scans -> a calibrated rig: its quantities, what is known of them, what to do."""
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import torch
+from torch import Tensor
 
 from lsvision.errors import CalibrationError
-from lsvision.geometry import RawPair, ideal_rig, rotation_from_vector, sharp_depth_mm, with_quantities
+from lsvision.geometry import (
+    RawPair,
+    ideal_rig,
+    rotation_from_vector,
+    sharp_depth_mm,
+    with_covariance,
+    with_quantities,
+)
 from lsvision.stages.rig.advice import next_scan
 from lsvision.stages.rig.config import RigConfig
 from lsvision.stages.rig.height_shape import HeightShape
 from lsvision.stages.rig.held_out import FEWEST_BOARDS, HeldOut
 from lsvision.stages.rig.model import QUANTITIES, RigPrior
 from lsvision.stages.rig.observability import unobserved
+from lsvision.stages.rig.shaken import allow_for_line_motion
 from lsvision.stages.rig.sightings import CameraSighting, Sightings
 from lsvision.stages.rig.solve import RigSolution, solve_rig
 from lsvision.types import (
@@ -40,7 +48,8 @@ def calibrate_rig(sightings: Sightings, scans: Sequence[str], rig: RawRig, confi
         CalibrationError: the corners do not determine the boards' poses.
     """
     prior = RigPrior.of(rig, config)
-    solution = solve_rig(sightings, prior, config)
+    shaken = allow_for_line_motion(solve_rig(sightings, prior, config), config)
+    solution = shaken.solution
     shared = solution.shared
     if not bool(shared.vector.isfinite().all() & solution.found.factor.isfinite().all()):
         raise CalibrationError(f"{', '.join(scans)}: the corners do not determine the boards' poses")
@@ -48,18 +57,18 @@ def calibrate_rig(sightings: Sightings, scans: Sequence[str], rig: RawRig, confi
     shape = HeightShape.of(rig, shared, prior.sigma, depth_range_mm)
     weak = unobserved(solution.whitened_covariance, shape, config.observed_share)
     advice = next_scan(solution, shape, depth_range_mm).in_words
-    enough = config.held_out and solution.sightings.boards >= FEWEST_BOARDS
+    enough = config.held_out and solution.sightings.boards >= FEWEST_BOARDS and not shaken.errors
     held_out = HeldOut.of(solution, config) if enough else None
     reasons = [*_faults(solution), *_contradicting(solution, scans, held_out)]
     bending = [combination for combination in weak if combination.bend_um >= config.least_height_um]
     if bending and not reasons:
         reasons = [*_left_to_the_data_sheet(bending), advice]
-    sigma = solution.covariance.diagonal().sqrt().tolist()
     found = with_quantities(rig, shared.quantities)
+    covariance = _about_own_depth(solution.covariance, rig, found)
     return RigCalibration(
-        rig=replace(found, sigma=tuple(zip(RIG_QUANTITIES, sigma[:QUANTITIES], strict=True))),
-        motion=Motion(shared.n, solution.covariance[QUANTITIES:, QUANTITIES:]),
-        covariance=solution.covariance,
+        rig=with_covariance(found, covariance[:QUANTITIES, :QUANTITIES]),
+        motion=Motion(shared.n, covariance[QUANTITIES:, QUANTITIES:]),
+        covariance=covariance,
         boards=_boards(solution, scans, held_out),
         residuals=_residuals(solution),
         noise_scale=float(solution.noise_scale),
@@ -68,7 +77,18 @@ def calibrate_rig(sightings: Sightings, scans: Sequence[str], rig: RawRig, confi
         advice=advice,
         verdict=_verdict(solution, bool(bending)),
         reasons=tuple(reasons),
+        errors_along_scan=shaken.errors,
     )
+
+
+def _about_own_depth(covariance: Tensor, start: RawRig, found: RawRig) -> Tensor:
+    """Covariance of a rig whose plane counts depth from its own z0, from that of one that does from the start's."""
+    moved = RawPair.of(found).z0_mm - RawPair.of(start).z0_mm
+    change = torch.eye(len(covariance), dtype=covariance.dtype)
+    offset, slope = (RIG_QUANTITIES.index(f"right.view_plane.{name}") for name in ("offset_mm", "slope_z"))
+    change[offset, slope] = moved
+    both = change @ covariance @ change.mT
+    return (both + both.mT) / 2
 
 
 def _verdict(solution: RigSolution, bending: bool) -> RigVerdict:

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from lsvision.schema import Checked, NonNegative, Positive, PositiveInt
+from lsvision.schema import Checked, NonNegative, Positive, PositiveInt, PositiveOrInfinite
 
 
 @dataclass(frozen=True)
@@ -32,6 +32,8 @@ class RigConfig(RigSigmas):
     ``RigSigmas`` elsewhere. A corner further off than ``outlier_sigma`` of its standard deviations, as they turn out,
     is left out. A combination of quantities counts as observed where its sigma is at most ``observed_share`` of the
     prior's, and matters where it alone bends the heights of the field by ``least_height_um`` (rms) or more.
+    Errors that all corners of a line share, as of an object that shakes, are allowed for where they make the corners
+    ``correlated_odds`` times as probable; infinite: never.
     """
 
     outlier_sigma: Positive = 5.0
@@ -42,4 +44,5 @@ class RigConfig(RigSigmas):
     depth_range_mm: Positive = (
         52.0  # in which the cameras see sharp: heights matter there, and proposed boards stay in it
     )
+    correlated_odds: PositiveOrInfinite = 50.0
     held_out: bool = True  # whether each board is also predicted by the rig of the others; with three boards or more

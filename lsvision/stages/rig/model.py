@@ -114,13 +114,17 @@ class RigModel:
         at_middle = seen - torch.stack([torch.zeros_like(middle), middle, torch.zeros_like(middle)], -1)[..., None, :]
         return cls(prior, fit_rigid(body, at_middle, sightings.valid), middle, body)
 
+    def placed(self, state: BorderedState) -> Float[Tensor, "*batch boards corners 3"]:
+        """Where the corners are before line 0, mm."""
+        n, poses = self.prior.shared(state.shared).n, state.own
+        rotation = rotation_from_vector(poses[..., :3]) @ self.start.rotation
+        moved = self.start.translation + poses[..., 3:] + self.middle_mm[..., None] * n[..., None, :]
+        return transform(rotation, moved, self.body_points)
+
     def predict(self, state: BorderedState) -> Predicted:
         """Where both cameras see the corners."""
-        shared, poses = self.prior.shared(state.shared), state.own
+        shared, points = self.prior.shared(state.shared), self.placed(state)
         pair = RawPair.of(self.prior.rig, shared.quantities[..., None, None, :])
         n = shared.n[..., None, None, :]
-        rotation = rotation_from_vector(poses[..., :3]) @ self.start.rotation
-        moved = self.start.translation + poses[..., 3:] + self.middle_mm[..., None] * n[..., 0, :]
-        points = transform(rotation, moved, self.body_points)
         left, right = pair.seen_left(points, n), pair.seen_right(points, n)
         return Predicted(*(torch.stack([seen.column, seen.travel], dim=-1) for seen in (left, right)))

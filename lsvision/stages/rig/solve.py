@@ -27,7 +27,8 @@ class RigSolution:
     """The posterior of a batch of problems.
 
     ``sightings`` are without the corners that were left out, which ``outliers`` counts by board; ``noise_scale`` is on
-    the corners' sigma, at least 1.
+    the corners' sigma, at least 1. ``along`` is the lower Cholesky factor of the covariance of each board's residuals,
+    in sigmas as stated, where its corners err together; None where they do not.
     """
 
     model: RigModel
@@ -35,6 +36,7 @@ class RigSolution:
     outliers: Int[Tensor, "*batch boards"]
     found: BorderedFit
     noise_scale: Float[Tensor, "*batch"]
+    along: Float[Tensor, "boards rows rows"] | None = None
 
     @property
     def shared(self) -> Shared:
@@ -55,7 +57,8 @@ class RigSolution:
     @property
     def whitened(self) -> Float[Tensor, "*batch boards corners 4"]:
         """Residuals of the corners, measured less predicted, in sigmas as stated; zero where a corner was left out."""
-        return corner_residuals(self.model, self.sightings, self.found.state)
+        residuals = corner_residuals(self.model, self.sightings, self.found.state)
+        return residuals if self.along is None else whitened_along(residuals, self.along)
 
 
 def solve_rig(sightings: Sightings, prior: RigPrior, config: RigConfig) -> RigSolution:
@@ -64,9 +67,7 @@ def solve_rig(sightings: Sightings, prior: RigPrior, config: RigConfig) -> RigSo
     zeros = sightings.left.position.new_zeros(*sightings.valid.shape[:-1], SHARED)
     state = BorderedState(zeros[..., 0, :], zeros[..., :POSE])
     state, kept = _without_outliers(model, sightings, state, config)
-    chi_square = corner_residuals(model, kept, state).square().sum((-3, -2, -1))
-    freedom = 4.0 * kept.valid.sum((-2, -1)) - POSE * sightings.boards
-    scale = (chi_square / freedom.clamp(min=1)).sqrt().clamp(min=1.0)
+    scale = noise_scale_of(corner_residuals(model, kept, state), kept)
     found = fit_rig(model, kept, state, _each(kept, scale.reciprocal()), config)
     return RigSolution(model, kept, sightings.valid.sum(-1) - kept.valid.sum(-1), found, scale)
 
@@ -81,6 +82,22 @@ def corner_residuals(
         for eye, there in ((sightings.left, predicted.left), (sightings.right, predicted.right))
     ]
     return torch.where(sightings.valid[..., None], torch.cat(rows, dim=-1), 0.0)
+
+
+def whitened_along(
+    residuals: Float[Tensor, "boards corners 4"], along: Float[Tensor, "boards rows rows"]
+) -> Float[Tensor, "boards corners 4"]:
+    """Residuals of corners that err together, as many and independent."""
+    rows = residuals.flatten(-2)[..., None]
+    return torch.linalg.solve_triangular(along, rows, upper=False)[..., 0].unflatten(-1, (-1, 4))
+
+
+def noise_scale_of(
+    residuals: Float[Tensor, "*batch boards corners 4"], sightings: Sightings
+) -> Float[Tensor, "*batch"]:
+    """How many times larger than stated residuals are, at least 1; the boards' poses were fitted to them."""
+    freedom = 4.0 * sightings.valid.sum((-2, -1)) - POSE * sightings.boards
+    return (residuals.square().sum((-3, -2, -1)) / freedom.clamp(min=1)).sqrt().clamp(min=1.0)
 
 
 def _without_outliers(
@@ -126,10 +143,16 @@ def fit_rig(
     start: BorderedState,
     weight: Float[Tensor, "*batch boards corners"],
     config: RigConfig,
+    along: Float[Tensor, "boards rows rows"] | None = None,
 ) -> BorderedFit:
-    """Estimate rig, motion and poses from corners; ``weight`` is what each residual in sigmas is multiplied by."""
+    """Estimate rig, motion and poses from corners; ``weight`` is what each residual in sigmas is multiplied by.
+
+    Args:
+        along: as of ``RigSolution``.
+    """
 
     def rows(state: BorderedState) -> Tensor:
-        return (corner_residuals(model, sightings, state) * weight[..., None]).flatten(-2)
+        residuals = corner_residuals(model, sightings, state) * weight[..., None]
+        return (residuals if along is None else whitened_along(residuals, along)).flatten(-2)
 
     return bordered_least_squares(rows, start, max_iterations=config.max_iterations, tolerance=config.tolerance)

@@ -8,9 +8,9 @@ import torch
 from torch import Tensor
 
 from lsvision.image.board.correlated_noise import BoardNoise
-from lsvision.image.board.edge_profile import EdgeProfile, _odd_shapes, board_noise
+from lsvision.image.board.edge_profile import EdgeProfile, _KnotShapes, board_noise
 from lsvision.image.board.saddle import SaddleFit, fit_saddles
-from lsvision.image.board.saddle_model import BlurredEdge
+from lsvision.image.board.saddle_model import PIXEL_VARIANCE, BlurredEdges, Saddle
 from tests.image.board.conftest import SIZE, saddle_windows
 
 CORNERS = 88
@@ -48,18 +48,18 @@ def test_the_profile_is_that_of_the_pixels():
     windows, _, angles = sampled_windows(samples, angle)
     fit = fit_saddles(windows, angles)
     profile = EdgeProfile.of(fit, EVERY)
-    model = BlurredEdge.through_corner(
-        profile.knots[None] / math.cos(angle),
-        torch.zeros_like(profile.knots)[None],
+    model = BlurredEdges.through_corners(
+        torch.zeros(1, 2).double(),
         torch.tensor([[angle]]).double(),
-        fit.parameters.blur.mean().reshape(1, 1),
+        fit.parameters.blur.mean()[None],
+        torch.stack([profile.knots / math.cos(angle), torch.zeros_like(profile.knots)]),
     )
     # What another blur would change of the edge is in the fit.
-    by_blur = model.by_blur[0] / model.by_blur[0].norm()
+    by_blur = model.by_blur[0, 0] / model.by_blur[0, 0].norm()
     expected, found = (
         profile - by_blur * (profile @ by_blur)
         for profile in (
-            staircase(profile.knots, angle, samples) - model.value[0],
+            staircase(profile.knots, angle, samples) - model.value[0, 0],
             profile.amount[: len(profile.knots)],
         )
     )
@@ -67,13 +67,51 @@ def test_the_profile_is_that_of_the_pixels():
     assert (found - expected).norm() < 0.4 * expected.norm()
 
 
-def test_values_are_those_of_the_shapes():
+def odd_shapes(saddles: Saddle, knots: Tensor) -> Tensor:
+    """Change of the grey values of all pixels by the value of the profile at each knot, of either edge."""
+    across = saddles.edges.across
+    hats = (1 - (across.abs()[:, :, None] - knots[:, None]).abs() / (knots[1] - knots[0])).clamp(min=0)
+    return (hats * (across.sign() * saddles.steps())[:, :, None]).flatten(1, 2)
+
+
+def masked_fit() -> SaddleFit:
+    """Of windows of which some pixels are not fitted, as those beyond the squares are not."""
     windows, _, angles = sampled_windows(2, 0.3)
-    fit = fit_saddles(windows, angles)
+    return fit_saddles(windows, angles, torch.rand(windows.shape) < 0.9)
+
+
+def test_values_are_those_of_the_shapes():
+    fit = masked_fit()
     profile = EdgeProfile.of(fit, EVERY)
     saddles = fit.saddles(EVERY)
-    shapes = profile.amount @ _odd_shapes(saddles, profile.knots)
+    shapes = profile.amount @ odd_shapes(saddles, profile.knots)
     torch.testing.assert_close(profile.values(saddles), shapes, rtol=0, atol=1e-9)
+
+
+def test_shapes_near_the_edges_are_those_of_all_pixels():
+    fit = masked_fit()
+    knots = 0.03 * (torch.arange(40).double() + 0.5)
+    near = _KnotShapes.of(fit.saddles(EVERY), fit.residuals.weight, knots)
+    every = odd_shapes(fit.saddles(EVERY), knots) * fit.residuals.weight[:, None]
+    images = torch.randn(CORNERS, SIZE**2, 3).double()
+    torch.testing.assert_close(near.products(images), every @ images)
+    torch.testing.assert_close(near.gram(), (every @ every.mT).sum(0))
+
+
+def test_the_profile_solves_the_ridge_regression_over_all_pixels():
+    fit = masked_fit()
+    profile = EdgeProfile.of(fit, EVERY)
+    width = (fit.parameters.blur.square().mean() + PIXEL_VARIANCE).sqrt()
+    torch.testing.assert_close(profile.knots, 0.1 * width * (torch.arange(50).double() + 0.5))
+    shapes = odd_shapes(fit.saddles(EVERY), profile.knots) * fit.residuals.weight[:, None]
+    known = torch.linalg.qr(fit.residuals.jacobian[:, :18].mT).Q
+    left = shapes - (shapes @ known) @ known.mT
+    normal, right = (left @ shapes.mT).sum(0), (left @ fit.misfit[..., None]).sum(0)[:, 0]
+    noise = fit.residual.square().mean()
+    variance = (right.square().sum() - noise * normal.trace()) / normal.square().sum()
+    ridge = noise / variance + 1e-9 * normal.diagonal().mean()
+    expected = torch.linalg.solve(normal + ridge * torch.eye(100).double(), right)
+    torch.testing.assert_close(profile.amount, expected, rtol=0, atol=1e-9)
 
 
 def test_noise_is_no_profile():

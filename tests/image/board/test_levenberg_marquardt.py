@@ -3,8 +3,8 @@
 import pytest
 import torch
 
-from lsvision.image.board.levenberg_marquardt import Linearisation, NormalMatrix, Windows, fit_parameters
-from lsvision.image.board.saddle_model import FULL, PLAIN, SaddleParameters
+from lsvision.image.board.levenberg_marquardt import Linearisation, NormalMatrix, Windows, fit_parameters, pixel_grid
+from lsvision.image.board.saddle_model import FULL, PLAIN, Saddle, SaddleParameters
 from tests.image.board.conftest import SIZE, saddle_windows
 from tests.image.board.test_saddle_model import plain_formula
 
@@ -60,7 +60,7 @@ def test_nothing_near_the_minimum_is_better(windows, start, model):
     fitted = fit_parameters(windows, start, model, smallest_step_px=1e-9, iterations=40)
     frozen = [column for column in range(17) if column not in model.free]
     assert torch.equal(fitted.columns[:, frozen], start.columns[:, frozen])
-    best = Linearisation.of(windows, fitted, model)
+    best = Linearisation.of(windows, fitted.parameters, model)
     for column in model.free:
         for step in (-1e-3, 1e-3):
             moved = fitted.columns.clone()
@@ -72,9 +72,34 @@ def test_no_step_makes_a_fit_worse(windows, start):
     cost = Linearisation.of(windows, start, FULL).cost
     for iterations in range(1, 6):
         fitted = fit_parameters(windows, start, FULL, smallest_step_px=0.0, iterations=iterations)
-        latest = Linearisation.of(windows, fitted, FULL).cost
+        latest = Linearisation.of(windows, fitted.parameters, FULL).cost
         assert (latest <= cost).all()
         cost = latest
+
+
+def test_a_blur_at_the_end_of_its_range_delays_no_fit(corners, start):
+    position, _, blur = corners
+    columns = start.columns.clone()
+    columns[:, :2], columns[:, 4] = 0.3 * position, 0.01  # no blur at all but that of the pixels
+    grid = pixel_grid(SIZE, columns)
+    pixels = Saddle.on_grid(SaddleParameters(columns), grid).values() + torch.randn(len(blur), SIZE**2).double()
+    windows = Windows(pixels, torch.ones_like(pixels), grid, torch.ones(len(blur), dtype=torch.bool))
+    plain = fit_parameters(windows, start, PLAIN, smallest_step_px=1e-2, iterations=12).parameters
+    few, many = (fit_parameters(windows, plain, FULL, smallest_step_px=0.0, iterations=n).parameters for n in (5, 60))
+    assert (many.blur == 0.1).sum() > 10
+    assert (few.position - many.position).abs().max() < 1e-4
+
+
+def test_the_inverse_of_a_singular_matrix_is_its_pseudo_inverse():
+    jacobian = torch.randn(3, 4, 20).double()
+    jacobian[1, 2] = jacobian[1, 0]
+    jacobian[2] = 0
+    inverse = NormalMatrix.of(jacobian).inverse()
+    for ours, rows in zip(inverse, jacobian, strict=True):
+        length = torch.linalg.vector_norm(rows, dim=-1)
+        length = torch.where(length > 0, length, 1.0)
+        scaled = rows / length[:, None]
+        torch.testing.assert_close(ours, torch.linalg.pinv(scaled @ scaled.mT) / length / length[:, None])
 
 
 def test_a_window_of_one_value_stays_finite():

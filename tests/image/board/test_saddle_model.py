@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from lsvision.image.board.saddle_model import FULL, PLAIN, BlurredEdge, Saddle, SaddleParameters
+from lsvision.image.board.saddle_model import FULL, PLAIN, BlurredEdges, Saddle, SaddleParameters
 
 
 def plain_formula(columns: Tensor, grid: Tensor) -> Tensor:
@@ -55,11 +55,12 @@ def test_values_by_hand():
 @pytest.mark.parametrize(("blur", "largest"), [(0.3, 5e-3), (0.6, 1e-3)])
 def test_an_edge_is_the_mean_over_a_square_pixel(angle, blur, largest):
     u = torch.linspace(-2, 2, 41).double()
-    edge = BlurredEdge.through_corner(u[None], 0.3 * u[None], *torch.tensor([[[angle]], [[blur]]]).double())
+    centre, direction = torch.zeros(1, 2).double(), torch.tensor([[angle]]).double()
+    edges = BlurredEdges.through_corners(centre, direction, torch.tensor([blur]).double(), torch.stack([u, 0.3 * u]))
     node, weight = (torch.from_numpy(part) / 2 for part in np.polynomial.legendre.leggauss(30))
     across = (u[:, None, None] + node[:, None]) * math.cos(angle) + (0.3 * u[:, None, None] + node) * math.sin(angle)
     mean = torch.erf(across / (math.sqrt(2) * blur)) @ weight @ weight
-    assert (edge.value[0] - mean).abs().max() < largest
+    assert (edges.value[0, 0] - mean).abs().max() < largest
 
 
 def test_other_shapes_turn_with_the_picture_and_move_no_corner(parameters, grid):

@@ -81,10 +81,12 @@ def naive_refinement(left, right, start, options):
         true_texture = max(texture - variance * 0.5 / 1.6, 0) + prior
         sigma[p] = math.sqrt((texture + prior) * variance / max(count, 1)) / true_texture
     gains = SigmaGains.of(options.window, options.iterations)
-    deviation = {p: min(max(mean(disparity, p) - disparity[p], -0.8), 0.8) ** 2 for p in pixels}
+    deviation = {p: min(max(mean(disparity, p) - disparity[p], -0.8), 0.8) for p in pixels}
+    squared, wide = {p: deviation[p] ** 2 for p in pixels}, {p: mean(deviation, p) ** 2 for p in pixels}
     for p in pixels:
         predicted = gains.iterations * sigma[p]
-        sigma[p] = math.sqrt((0.9 * gains.scatter) ** 2 * mean(deviation, p) + 0.15 * predicted**2 + 0.01**2)
+        scatter = mean(squared, p) + min(gains.wide * mean(wide, p), (1.25 * gains.scatter**2 - 1) * mean(squared, p))
+        sigma[p] = math.sqrt(0.92**2 * scatter + 0.08 * predicted**2 + 0.01**2)
     return tuple(torch.tensor([each[p] for p in pixels]).view(lines, width) for each in (disparity, sigma))
 
 

@@ -67,6 +67,18 @@ def test_a_gap_at_the_end_of_a_line_may_be_as_low_as_the_range_allows():
     assert not sigma(left, right, values)[20:180].any()
 
 
+def test_a_low_step_counts_where_windows_fit_the_other_side_better():
+    left, right = pair()
+    right[:, UPPER.start - HEIGHT : UPPER.stop] = left[:, UPPER.start - HEIGHT : UPPER.stop]  # in truth there is none
+    values = disparity() * (2.5 / HEIGHT)
+    found = sigma(left, right, values)
+    assert (found[UPPER.start : UPPER.start + 3] > 0.2 * 2.5).all()
+    assert (found[UPPER.start + 20 : UPPER.stop - 20] == 0).all()
+    left, right = (100 + torch.randn(LINES, WIDTH) for _ in range(2))
+    noise = sigma(left, right, values)  # fits both sides
+    assert noise[UPPER.start - 5 : UPPER.start + 5].median() < 0.1 * 2.5
+
+
 def test_neither_a_slope_nor_a_small_step_counts():
     slope = (0.15 * torch.arange(WIDTH).float()).expand(LINES, WIDTH).contiguous()
     left, right = pair()

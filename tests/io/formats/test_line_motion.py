@@ -2,6 +2,7 @@
 
 import random
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import polars
@@ -11,7 +12,7 @@ import yaml
 
 from lsvision.errors import FileFormatError
 from lsvision.io import read_line_motion, read_scan, scan_files, scan_sha256, write_line_motion
-from lsvision.types import LineFinding, LineMotion, Travel
+from lsvision.types import LineFinding, LineMotion, SectionFit, Travel
 from tests.io.fuzz import fault_of
 
 LINES = 300  # of the fixture's scans
@@ -38,12 +39,14 @@ def test_round_trip(tmp_path):
         LineFinding("roll", "corrected", 1e-3),
         LineFinding("dy", "not observed", reason="nobody looked"),
     )
-    made = motion(findings=found)
+    laid = SectionFit("EN60E1", 177.0, 22.0, -1e-3, 0.01, 2e-3, 1e-4, 0.97, 0.3, 0.05, -0.4, 12.0, True)
+    made = replace(motion(findings=found), section=laid)
     write_line_motion(made, tmp_path / "m.parquet")
     read = read_line_motion(tmp_path / "m.parquet", LINES, TRAVEL)
     assert torch.equal(read.values, made.values)
     torch.testing.assert_close(read.covariance, made.covariance, rtol=1e-12, atol=0)
     assert read.findings == found
+    assert read.section == laid
 
 
 def test_columns_that_are_missing_are_zero_and_unknown(tmp_path):

@@ -61,9 +61,25 @@ def test_another_makers_file_is_read(shared_data):
     assert (rig.width_px, rig.left.principal_px, rig.view_plane) == (893, 446.0, ViewPlane())
 
 
+def test_the_covariance_comes_back_to_the_bit(tmp_path):
+    factor = [[math.sin(3.0 * i + j) if j <= i else 0.0 for j in range(14)] for i in range(14)]
+    covariance = tuple(
+        tuple(math.fsum(a * b for a, b in zip(row, other, strict=True)) for other in factor) for row in factor
+    )
+    rig = dataclasses.replace(RIG, covariance=covariance)
+    write_raw_rig(rig, tmp_path / "rig.yaml")
+    assert read_raw_rig(tmp_path / "rig.yaml") == rig
+
+
+EYE = [[float(i == j) for j in range(14)] for i in range(14)]
+
+
 @pytest.mark.parametrize(
     ("where", "value", "message"),
     [
+        (("covariance",), EYE[:3], "covariance: expected 14 rows of 14 numbers"),
+        (("covariance",), [[1.0] * 14, *EYE[1:]], "covariance: expected a symmetric matrix"),
+        (("covariance",), [[-1.0, *EYE[0][1:]], *EYE[1:]], "covariance: expected a positive semidefinite matrix"),
         (("left", "turn_deg"), 90.0, "left.turn_deg: expected a finite number > -90 and < 90, got 90"),
         (("right", "focal_length_mm"), 0.0, "right.focal_length_mm: expected a finite number > 0, got 0"),
         (("left", "distortion"), [0.1], r"left.distortion: expected a list of 2, got \[0.1\]"),

@@ -22,11 +22,19 @@ PATCH = (slice(90, 250), slice(170, 300))
 APART = 1.5
 
 
-def product(spacing: float, *, registered: bool, transport: str, encoder: EncoderConfig | None, corrected: bool = True):
+def product(
+    spacing: float,
+    *,
+    registered: bool,
+    transport: str,
+    encoder: EncoderConfig | None,
+    corrected: bool = True,
+    offset_mm: float = 0.0,
+):
     """Colours of a sheet seen by a sensor whose red and blue lines look ``spacing`` lines before and after green."""
     rig = dataclasses.replace(SMALL_RIG, color_spacing_lines=(-spacing, 0.0, spacing))
     sensor = SensorConfig(supersampling=2, noise=0.0, color_registered=registered)
-    sheet = SceneConfig(kind="sheet", yaw_deg=3.0)
+    sheet = SceneConfig(kind="sheet", yaw_deg=3.0, depth_offset_mm=offset_mm)
     source = simulate(rig, BOARD, sheet, MOTION, sensor, Acquisition(PITCH, transport=transport, encoder=encoder))
     scan = dataclasses.replace(depth_scan(source), color_registered=registered)
     if not corrected:
@@ -61,6 +69,15 @@ def test_red_and_blue_meet(registered: bool, transport: str, encoder: EncoderCon
     red, green, blue = (shift_along(trilinear[..., c], truth[..., c]) for c in range(3))
     assert abs(red - blue) <= 0.05
     assert max(abs(red), abs(green), abs(blue)) <= 0.05
+
+
+@pytest.mark.parametrize("offset_mm", [-20.0, 20.0])
+def test_red_and_blue_meet_at_other_depths(offset_mm: float) -> None:
+    """The lines look 2.5 % less apart 20 mm nearer: 0.2 of 8 rows."""
+    options = {"registered": True, "transport": "forward", "encoder": None, "offset_mm": offset_mm}
+    truth, trilinear = product(0.0, **options), product(8.0, **options)
+    red, blue = (shift_along(trilinear[..., c], truth[..., c]) for c in (0, 2))
+    assert max(abs(red), abs(blue)) <= 0.05
 
 
 def test_uncorrected_they_lie_as_far_apart_as_the_sensor_lines() -> None:

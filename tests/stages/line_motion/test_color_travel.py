@@ -6,11 +6,11 @@ import pytest
 import torch
 from torch import Tensor
 
-from lsvision.geometry import ProductFrame, scaled_rig, travel_at, without_trend
+from lsvision.geometry import ProductFrame, scaled_rig, travel_at, without_trend, zero_disparity_mm
 from lsvision.image.levels import PairLevels
 from lsvision.image.stereo.relation import PairRelation
 from lsvision.image.stereo.rows import RowOffset
-from lsvision.stages.line_motion.color_pair import ColorPair, color_pair
+from lsvision.stages.line_motion.color_pair import ColorPair, ObjectDepth, color_pair
 from lsvision.stages.line_motion.color_travel import ColorTravel, measure_color_travel, with_travel
 from lsvision.stages.line_motion.estimate import not_measured
 from lsvision.types import Scan, StereoPair, TensorImage, Transport, Travel
@@ -47,7 +47,8 @@ def seen(
     images = StereoPair(image, image)
     scan = Scan(Path("texture"), rig, Travel(PITCH, None, transport), images, registered)
     relation = PairRelation(PairLevels.of(images), RowOffset(0.0, 0.0), None)
-    pair = color_pair(scan, ProductFrame(rig, scan.travel, N), relation)
+    depth = ObjectDepth(torch.full((len(positions),), zero_disparity_mm(rig)).double(), torch.zeros(WIDTH - 4).double())
+    pair = color_pair(scan, ProductFrame(rig, scan.travel, N), relation, depth)
     assert pair is not None
     return pair
 

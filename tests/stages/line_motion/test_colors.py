@@ -8,13 +8,13 @@ import pytest
 import torch
 from torch import Tensor
 
-from lsvision.geometry import ProductFrame, object_pitch_mm, scaled_rig, without_trend
+from lsvision.geometry import ProductFrame, object_pitch_mm, scaled_rig, without_trend, zero_disparity_mm
 from lsvision.simulation import Acquisition, MotionConfig, SceneConfig, SensorConfig, Simulation, simulate
 from lsvision.simulation.rail import corrugation_mm, crown_place
 from lsvision.simulation.trajectory import cast_rays
 from lsvision.stages.disparity.config import DisparityConfig
 from lsvision.stages.disparity.depth import MatchedDepth, relation_of_scan
-from lsvision.stages.line_motion.color_pair import at_rows, color_pair
+from lsvision.stages.line_motion.color_pair import ObjectDepth, at_rows, color_pair
 from lsvision.stages.line_motion.color_registration import register_color
 from lsvision.stages.line_motion.config import LineMotionConfig
 from lsvision.stages.line_motion.knots import Knots
@@ -77,7 +77,7 @@ def depth_of(scan: Scan) -> Plain:
 
 def measured(source: Simulation, scan: Scan, config: LineMotionConfig = CONFIG) -> LineMotion:
     n = source.trajectory.n
-    return measure_line_motion(scan, depth_of(scan), Motion(n, torch.zeros(3, 3).double()), config)
+    return measure_line_motion(scan, depth_of(scan), Motion(n, torch.zeros(3, 3).double()), config).motion
 
 
 def amplitudes(source: Simulation, values: Tensor) -> Tensor:
@@ -109,9 +109,11 @@ def true_corrugation(source: Simulation) -> Tensor:
 def test_colors_show_what_moves_between_their_moments_and_no_shape(registered: bool) -> None:
     source, scan = rail(200, 0.8, 0.4, registered=registered)
     frame, depth = ProductFrame(scan.rig, scan.travel, source.trajectory.n), depth_of(scan)
-    pair = color_pair(scan, frame, relation_of_scan(scan, DisparityConfig()))
-    assert pair.channels == (0, 2)
     samples = LineSamples.of(depth.read(0, 200), frame, (-60.0, 60.0), slice(None))
+    middle = samples.z[samples.z < zero_disparity_mm(scan.rig)].mean()
+    far = ObjectDepth(middle.expand(200), torch.zeros(scan.rig.width_px).double())
+    pair = color_pair(scan, frame, relation_of_scan(scan, DisparityConfig()), far)
+    assert pair.channels == (0, 2)
     start = torch.zeros(200, 3).double()
     start[:, 1] = source.trajectory.vibration(torch.arange(200).double())[:, 1] - true_corrugation(source)
     q_x, height = placed(samples, start, frame)
@@ -121,17 +123,18 @@ def test_colors_show_what_moves_between_their_moments_and_no_shape(registered: b
     one, other = (
         at_rows(
             register_color(
-                pair, channel, 0, dataclasses.replace(shown, plane_y_mm=shift), start, (reference, 4.0)
+                pair, channel, 0, dataclasses.replace(shown, plane_slope=slope), start, (reference, 4.0)
             ).values,
             row,
         )
-        for channel, shift, row in zip(pair.channels, pair.shift_mm, pair.rows(), strict=True)
+        for channel, slope, row in zip(pair.channels, pair.plane_slopes, pair.rows(), strict=True)
     )
     later, earlier = pair.taken()
     true = (source.trajectory.vibration(later) - source.trajectory.vibration(earlier))[:, 1]
     error = ((one - other)[:, 1] - true)[12:-12]
     assert true.abs().max() > 0.1
-    assert (later - earlier).mean() == pytest.approx(8 / 1.0246, rel=1e-3)
+    apart = 8 / 1.0246 * float(middle) / zero_disparity_mm(scan.rig)
+    assert (later - earlier).mean() == pytest.approx(apart, rel=1e-3)
     assert error.std() < 0.04  # single lines
     assert error.mean().abs() < 0.006
 

@@ -14,7 +14,7 @@ from lsvision.geometry import scaled_rig, without_trend
 from lsvision.simulation import Acquisition, MotionConfig, SceneConfig, SensorConfig, Simulation, simulate
 from lsvision.stages.line_motion.config import LineMotionConfig
 from lsvision.stages.line_motion.measure import measure_line_motion
-from lsvision.types import DepthView, LineMotion, Motion, Scan, StoredDepth, TensorImage
+from lsvision.types import DepthView, LineMotion, Motion, Scan, Section, StoredDepth, TensorImage
 from tests.stages.rendered import BOARD, FULL_RIG
 
 RIG, PITCH, LINES = scaled_rig(FULL_RIG, 4), 0.28, 400
@@ -39,14 +39,14 @@ def matched(depth: Tensor, seed: int = 0) -> Tensor:
     return depth + SIGMA_MM * 9 * avg_pool2d(white, 9, 1)[0]
 
 
-def measure(depth: Tensor, config: LineMotionConfig = CONFIG) -> LineMotion:
+def measure(depth: Tensor, config: LineMotionConfig = CONFIG, section: Section | None = None) -> LineMotion:
     source, _ = rendered(STILL)
     image = TensorImage(torch.zeros(*depth.shape, 1, dtype=torch.uint8))
     z = TensorImage(depth[..., None].float())
     scan = Scan(Path("rail"), RIG, source.travel, DepthView(image, z))
     stored = StoredDepth(z, TensorImage(torch.full_like(z.tensor, SIGMA_MM)))
     motion = Motion(source.trajectory.n, torch.zeros(3, 3, dtype=torch.float64))
-    return measure_line_motion(scan, stored, motion, config)
+    return measure_line_motion(scan, stored, motion, config, section).motion
 
 
 def true_values(source: Simulation, lines: int = LINES) -> Tensor:

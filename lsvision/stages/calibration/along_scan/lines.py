@@ -89,14 +89,17 @@ def directions(problem: BoardProblem) -> Float[Tensor, "*batch boards corners 4 
 
 
 def latents(
-    problem: BoardProblem, roots: Float[Tensor, "#boards 4 knots columns"], knots: Knots = SEARCHED
+    problem: BoardProblem,
+    roots: Float[Tensor, "#boards 4 knots columns"],
+    knots: Knots = SEARCHED,
+    travel: Travel | None = None,
 ) -> Float[Tensor, "boards corners 3 latents"]:
     """What standard normal latents of each board displace its corners by, mm, for processes given by their roots.
 
     Args:
-        problem: of batch shape (). knots: at which the roots are.
+        problem: of batch shape (). knots: at which the roots are. travel: where these lie; on the corners if None.
     """
-    at_corners = Travel.of(problem).weights(problem, knots)[:, None] @ roots
+    at_corners = (travel or Travel.of(problem)).weights(problem, knots)[:, None] @ roots
     by_component = directions(problem).movedim(-2, 1)[..., None] * at_corners[..., None, :]
     return by_component.permute(0, 2, 3, 1, 4).flatten(-2)
 
