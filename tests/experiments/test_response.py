@@ -11,6 +11,7 @@ import yaml
 
 from lsvision.archive.identity import stamp_of
 from lsvision.io import NewScan, read_response, read_scan, write_scan
+from lsvision.stages.line_motion.measure import LineMeasurement
 from lsvision.stages.response.wander import WanderGains
 from lsvision.types import Travel
 from tests.archive.archives import RIG, make_calibration, make_scan, shaken
@@ -95,7 +96,8 @@ def test_an_archive_whose_objects_wander(command, tmp_path, capsys, monkeypatch)
     scan, calibration = make_scan(tmp_path / "scans" / "a", stereo=True), make_calibration(tmp_path / "n.json")
     gains = WanderGains(0.05 * torch.randn(64, 3, dtype=torch.float64), torch.full((64, 3), 1e-3), 40.0, 3.0)
     monkeypatch.setattr(
-        "lsvision.experiments.archive_response.measured_line_motion", lambda scan, *_: shaken(scan.lines)
+        "lsvision.experiments.archive_response.measured_line_motion",
+        lambda scan, *_: LineMeasurement(shaken(scan.lines)),
     )
     monkeypatch.setattr(
         "lsvision.experiments.archive_response.gains_of_scan", lambda *_: {"left": gains, "right": gains}
