@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from jaxtyping import Float
 from torch import Tensor
 
-from lsvision.estimation.linalg import apply, batch_first, batch_last
+from lsvision.estimation.linalg import apply, batch_first, batch_last, product
 
 NORMAL_OVER_MAD = 1.4826  # standard deviation of a normal distribution over its median absolute deviation
 
@@ -24,7 +24,7 @@ class Gaussian:
     @property
     def covariance(self) -> Float[Tensor, "*batch state state"]:
         """P."""
-        return self.factor @ self.factor.mT
+        return product(self.factor, self.factor.mT)
 
 
 @dataclass(frozen=True)

@@ -3,6 +3,7 @@
 import torch
 from torch import Tensor
 
+from lsvision.estimation import apply
 from lsvision.geometry import rotation_from_vector, scan_position
 
 STATE = torch.tensor([0.1, -0.2, 0.15, 20.0, 60.0, 800.0, 0.03, 1.02, 0.02], dtype=torch.float64)
@@ -26,5 +27,5 @@ def corner(states: Tensor, point: tuple[float, float] = (120.0, 80.0)) -> Tensor
 
 
 def times(matrix: Tensor, vector: Tensor) -> Tensor:
-    """Matrix times vector."""
-    return (matrix @ vector[..., None])[..., 0]
+    """Matrix times vector, with the same bits for one as for many."""
+    return apply(matrix, vector)

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from lsvision.errors import ConfigError
-from lsvision.estimation import Info, Posterior
+from lsvision.estimation import Info, Posterior, product
 from lsvision.stages.calibration.along_scan import (
     EdgeRows,
     ErrorsAlongScan,
@@ -92,7 +92,7 @@ class Solution:
         squared, corners = self._squared_residuals(path), problem.valid.sum(-1)
         board_rmse = (squared / corners).sqrt()
         motion_factor = torch.where(singular[..., None, None], torch.nan, posterior.factor[..., -3:, :])
-        covariance = motion_factor @ motion_factor.mT
+        covariance = product(motion_factor, motion_factor.mT)
         if bool((self.scatter > 1).any()):
             covariance = widened(covariance, self.scatter, self.config.prior_sigma)
         return BatchCalibration(

