@@ -23,7 +23,7 @@ pytestmark = pytest.mark.slow
 psutil = pytest.importorskip("psutil")
 
 MOMENTS = 10
-STRIPS = 6 * 13 + 12 + 12 * 14
+STRIPS = 6 * 13 + 12 + 12 * 14 + 12  # matching, line motion, correction, health
 MOST_SECONDS = 300
 
 

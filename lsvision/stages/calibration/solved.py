@@ -72,7 +72,7 @@ class Solution:
         problem, scale = self.problem.at(place), self.noise_scale[place]
         linearised = Linearised.of(problem, self.posterior.mean[place], self.config.prior_sigma)
         return processes_given_corners(
-            problem.scaled(scale), linearised, self.along_scan.spectrum.at(place), reach, self.edges
+            problem.scaled(scale), linearised, self.along_scan.variances[place], reach, self.edges
         )
 
     def rmse_with_lines_as_they_are(self) -> Float[Tensor, "*batch"]:

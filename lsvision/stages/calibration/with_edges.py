@@ -29,7 +29,7 @@ from lsvision.stages.calibration.along_scan.kernels import wave_length
 from lsvision.stages.calibration.along_scan.lines import Travel
 from lsvision.stages.calibration.model import refitted, residuals_in_sigmas
 from lsvision.stages.calibration.problem import BoardProblem
-from lsvision.stages.calibration.solution import estimate_white, wider
+from lsvision.stages.calibration.solution import estimate_white
 from lsvision.stages.calibration.solved import Solution
 from lsvision.types import BoardEdges
 
@@ -66,7 +66,7 @@ def _estimated(solution: Solution, edges: EdgeRows) -> Solution:
     # About poses that leave the least residuals: those of the posterior are off by what long waves are.
     linearised = Linearised.of(problem, refitted(problem, solution.posterior.mean), config.prior_sigma)
     errors = search_with_edges(
-        problem, linearised, edges, None if solution.edges is None else solution.along_scan.spectrum
+        problem, linearised, edges, None if solution.edges is None else solution.along_scan.variances
     )
     noise = with_processes(problem, covariance_root(errors.covariance(FINE))[None], FINE, edges)
     estimate = estimate_white(replace(problem, correlated=noise), solution.start, config)
@@ -75,14 +75,13 @@ def _estimated(solution: Solution, edges: EdgeRows) -> Solution:
         unlike=solution.along_scan.unlike,
         rms_mm=errors.rms_mm,
         length_mm=wave_length(errors.covariance(SEARCHED)) * Travel.of(problem).extent_mm,
-        spectrum=errors.spectrum,
+        variances=errors.variances,
         log_ratio=errors.log_ratio,
-        factor_of_n=errors.factor_of_n,
         noise=noise,
     )
     return replace(
         solution,
-        posterior=wider(estimate.posterior, errors.factor_of_n),
+        posterior=estimate.posterior,
         scatter=estimate.scatter,
         along_scan=along,
         edges=edges,
