@@ -185,8 +185,10 @@ class NormalEquations:
     def log_ratios(
         self, conditional: Conditional, family: KernelFamily, variances: Float[Tensor, " amplitudes"]
     ) -> Float[Tensor, "kernels amplitudes"]:
-        """Log likelihood ratios of a process of each kernel and variance, mm², to none."""
+        """Log likelihood ratios of a process of each kernel and variance, mm², to none; -inf without a likelihood."""
         knots = self.gram.shape[-1]
+        if not bool(torch.isfinite(conditional.matrix).all()):
+            return variances.new_full((len(family.log_prior), len(variances)), -torch.inf)
         process, cross = conditional.matrix[:, :knots, :knots], conditional.matrix[:, :knots, knots:]
         state, log_det = conditional.matrix[:, knots:, knots:], conditional.log_det
         parts = []
