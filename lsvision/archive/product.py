@@ -10,6 +10,7 @@ from lsvision.archive.line_motion import StoredLineMotion
 from lsvision.archive.planned import PlannedScan, Processing
 from lsvision.errors import FileFormatError
 from lsvision.geometry import ProductFrame, zero_disparity_mm
+from lsvision.image.stereo.relation import PairRelation
 from lsvision.io import ProductLayout, check_product, read_product, read_scan
 from lsvision.io.atomic import check_replaceable
 from lsvision.io.inside import path_inside
@@ -53,14 +54,8 @@ def product_layout(
     scan = read_scan(
         planned.files.path, repair_encoder=processing.repair_encoder, missing_lines=processing.missing_lines
     )
-    if scan.missing:
-        log.warning("%s: %d of %d lines are missing: not measured", scan.path, scan.missing_lines, scan.lines)
     relation = relation_of_scan(scan, processing.disparity)
-    if relation is not None and relation.rows.whole:
-        log.warning(
-            "%s: the cameras are out of step by %+.2f ± %.2f lines: the right image is matched %+d lines later",
-            scan.path, relation.rows.lines, relation.rows.sigma, relation.rows.whole,
-        )  # fmt: skip
+    _warn_of_faults(scan, relation)
     repair = EncoderRepair.of(scan.travel)
     calibration = planned.calibration.calibration
     motion = calibration.motion
@@ -98,6 +93,17 @@ def product_layout(
         source_dtype=source_dtype(planned.lines),
         line_motion=None if found is None else found.motion,
     )
+
+
+def _warn_of_faults(scan: Scan, relation: PairRelation | None) -> None:
+    """Log what is wrong with a scan that is corrected all the same."""
+    if scan.missing:
+        log.warning("%s: %d of %d lines are missing: not measured", scan.path, scan.missing_lines, scan.lines)
+    if relation is not None and relation.rows.whole:
+        log.warning(
+            "%s: the cameras are out of step by %+.2f ± %.2f lines: the right image is matched %+d lines later",
+            scan.path, relation.rows.lines, relation.rows.sigma, relation.rows.whole,
+        )  # fmt: skip
 
 
 def _missing_in(scan: Scan) -> dict[str, object]:

@@ -73,7 +73,7 @@ class LightsBeside:
         """Reflections of both lights, after Blinn."""
         up = self.z_mm - facet.z
         left, right = (
-            _blinn(facet, (light_x - facet.x, torch.zeros_like(up), up), eye_x_mm, sharpness)
+            _blinn(facet, _Direction(light_x - facet.x, torch.zeros_like(up), up), eye_x_mm, sharpness)
             for light_x in (self.left_x_mm, self.right_x_mm)
         )
         return left + right
@@ -110,7 +110,8 @@ class LightsAlong:
         mirrored_x, mirrored_z = towards * facet.normal_x - view_x, towards * facet.normal_z - view_z
         rise = (mirrored_z / up).clamp(min=1e-3)  # both point up to the cameras
         aside = (facet.x + mirrored_x / rise).clamp(self.first_x_mm, self.last_x_mm) - facet.x
-        return 2.0 * _blinn(facet, (aside, torch.full_like(up, _BEFORE_MM), up), eye_x_mm, sharpness)
+        to_light = _Direction(aside, torch.full_like(up, _BEFORE_MM), up)
+        return 2.0 * _blinn(facet, to_light, eye_x_mm, sharpness)
 
 
 def line_lights(rig: Rig, lights: Lights = "beside") -> Lighting:
@@ -126,18 +127,27 @@ def _facing(aside: Tensor, up_part: Tensor, up_squared: Tensor, normal_x: Tensor
     return towards.clamp_(min=0.0).div_(torch.addcmul(up_squared, aside, aside))
 
 
-def _blinn(facet: Facet, to_light: tuple[Tensor, Tensor, Tensor], eye_x_mm: float, sharpness: float) -> Tensor:
+@dataclass(frozen=True)
+class _Direction:
+    """A direction, of any length until it is ``unit``."""
+
+    x: Tensor
+    y: Tensor
+    z: Tensor
+
+    @property
+    def unit(self) -> "_Direction":
+        """The same of length 1."""
+        scale = (self.x * self.x + self.y * self.y + self.z * self.z).rsqrt()
+        return _Direction(self.x * scale, self.y * scale, self.z * scale)
+
+
+def _blinn(facet: Facet, to_light: _Direction, eye_x_mm: float, sharpness: float) -> Tensor:
     """Power of the cosine between the normal and the middle of the directions to light and eye.
 
     Source: Blinn 1977, Models of light reflection for computer synthesized pictures.
     """
-    view = eye_x_mm - facet.x, torch.zeros_like(facet.x), -facet.z
-    light, eye = (_unit(direction) for direction in (to_light, view))
-    half_x, _, half_z = _unit((light[0] + eye[0], light[1] + eye[1], light[2] + eye[2]))
-    return (half_x * facet.normal_x + half_z * facet.normal_z).clamp(min=0.0).pow(sharpness)
-
-
-def _unit(direction: tuple[Tensor, Tensor, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
-    x, y, z = direction
-    scale = (x * x + y * y + z * z).rsqrt()
-    return x * scale, y * scale, z * scale
+    light = to_light.unit
+    eye = _Direction(eye_x_mm - facet.x, torch.zeros_like(facet.x), -facet.z).unit
+    half = _Direction(light.x + eye.x, light.y + eye.y, light.z + eye.z).unit
+    return (half.x * facet.normal_x + half.z * facet.normal_z).clamp(min=0.0).pow(sharpness)

@@ -15,20 +15,20 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from lsvision.estimation import NORMAL_OVER_MAD
 from lsvision.geometry import ProductFrame, object_pitch_mm, travel_at
 from lsvision.stages.line_motion.config import LineMotionConfig
-from lsvision.stages.line_motion.profiles import LineSamples, columns_of, reference_profile
+from lsvision.stages.line_motion.crown import CrownedLines
+from lsvision.stages.line_motion.profiles import columns_of, reference_profile
 from lsvision.stages.line_motion.register import placed, register
 from lsvision.types import Depth, DepthSource, Motion, Scan
 
 _PLACES, _LINES = 24, 8  # along the scan, and lines of each
 _ROUNDS = 3  # of making the reference of lines and aligning them to it
 _ROLL_SIGMA = 2e-5  # rad, of a roll that counts as none
-_CROWN_SHARE, _CROWN_COLUMNS, _BELOW_MM = 0.95, 512, 5.0  # as of the motion from line to line
 _LEAST_SHARE = 0.3  # of the usual samples, that a line must have
 _FEWEST = 6  # places, of which a trend is taken
 _OUTLIER = 3.0  # robust standard deviations
-_MAD = 1.4826
 _UNSEEN_MM = 1.0  # standard deviation of a line's displacement beyond which its profile does not show it
 
 
@@ -72,12 +72,8 @@ def _places(lines: int) -> list[range]:
 
 def _displacements(depth: Depth, frame: ProductFrame, config: LineMotionConfig) -> Float[Tensor, "lines 2"] | None:
     """δx and δz of lines against their mean profile, mm, NaN where a line shows none; None where no line does."""
-    samples = LineSamples.of(depth, frame, config.height_range_mm, slice(None))
-    values = samples.z.new_zeros(len(samples.z), 3)
-    height = placed(samples, values, frame)[1]
-    crown = height[:, :: max(1, height.shape[1] // _CROWN_COLUMNS)].nanquantile(_CROWN_SHARE, dim=1)
-    values[:, 1] = (crown - crown.nanmedian()).nan_to_num()
-    samples = samples.among(~(height < crown[:, None] - config.profile_depth_mm - _BELOW_MM))
+    crowned = CrownedLines.of(depth, frame, config)
+    samples, values = crowned.samples, crowned.values
     for _ in range(_ROUNDS):
         q_x, height = placed(samples, values, frame)
         reference = reference_profile(q_x, height, object_pitch_mm(frame.rig), config.profile_depth_mm)
@@ -105,7 +101,7 @@ def _angle(along: Tensor, shift: Tensor, places: int) -> tuple[float, float]:
         design = torch.stack([x - x.mean(), torch.ones_like(x)], -1)
         slope, level = torch.linalg.lstsq(design, y[:, None]).solution[:, 0]
         off = y - (slope * design[:, 0] + level)
-        usual = _MAD * off.abs().median()
+        usual = NORMAL_OVER_MAD * off.abs().median()
         y = y.masked_fill(off.abs() > _OUTLIER * usual, torch.nan) if usual > 0 else y
     sigma = (off.square().sum() / (len(x) - 2) / design[:, 0].square().sum()).sqrt()
     return math.degrees(math.atan(float(slope))), math.degrees(float(sigma))

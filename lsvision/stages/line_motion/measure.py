@@ -32,6 +32,7 @@ from lsvision.stages.line_motion.color_differences import measure_color_differen
 from lsvision.stages.line_motion.color_pair import ColorPair, ObjectPlace, color_pair
 from lsvision.stages.line_motion.color_travel import ColorTravel, measure_color_travel, with_travel
 from lsvision.stages.line_motion.config import LineMotionConfig
+from lsvision.stages.line_motion.crown import CrownedLines
 from lsvision.stages.line_motion.errors import ErrorSums, LineErrors
 from lsvision.stages.line_motion.estimate import estimate, noisy_values, not_measured
 from lsvision.stages.line_motion.profiles import LineSamples, Reference, columns_of, reference_profile
@@ -45,8 +46,6 @@ _APART = 4  # lines of a window; neighbours err alike
 _READ_LINES, _AT_ONCE = 1024, 256  # read and registered at once
 _SUMMED_READS = 8  # whose residuals say how large the errors are
 _ROUNDS = 2  # of making the reference of lines and aligning them to it, before the last reference
-_CROWN_SHARE, _CROWN_COLUMNS = 0.95, 512  # of the heights of a line: about its crown, or lower; of columns that do
-_BELOW_MM = 5.0  # of the profile's depth, from where on samples take no part
 
 
 @dataclass(frozen=True)
@@ -167,12 +166,8 @@ def _placed_section(
 def _shown(frame: ProductFrame, depth: DepthSource, config: LineMotionConfig) -> _Shown | None:
     """What lines from all over the scan have in common; None where they have nothing."""
     spread = _spread_lines(depth, config.reference_lines)
-    samples = LineSamples.of(spread, frame, config.height_range_mm, slice(None))
-    values = samples.z.new_zeros(len(samples.z), 3)
-    height = placed(samples, values, frame)[1]
-    crown = height[:, :: max(1, height.shape[1] // _CROWN_COLUMNS)].nanquantile(_CROWN_SHARE, dim=1)
-    values[:, 1] = (crown - crown.nanmedian()).nan_to_num()
-    samples = samples.among(~(height < crown[:, None] - config.profile_depth_mm - _BELOW_MM))
+    crowned = CrownedLines.of(spread, frame, config)
+    samples, values = crowned.samples, crowned.values
     for _ in range(_ROUNDS):
         reference, columns = _seen_along(placed(samples, values, frame), frame, config)
         if reference is None or columns is None:

@@ -7,12 +7,11 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from lsvision.estimation import NORMAL_OVER_MAD
 from lsvision.image.brightness import white_level
 from lsvision.image.levels import CameraLevels
 from lsvision.image.missing import missing_mask
 from lsvision.types import LineImage
-
-_MAD = 1.4826  # standard deviation of a normal distribution over its median absolute deviation
 
 
 @dataclass(frozen=True)
@@ -92,4 +91,4 @@ def near(
 ) -> Bool[Tensor, "samples *batch"]:
     """Which values lie within ``reach`` robust standard deviations of a centre, half a code or more."""
     off = (values - center).abs()
-    return off <= (reach * _MAD * median(off)).clamp(min=0.5)
+    return off <= (reach * NORMAL_OVER_MAD * median(off)).clamp(min=0.5)

@@ -22,6 +22,8 @@ import torch.nn.functional as F  # noqa: N812
 from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 
+from lsvision.estimation import NORMAL_OVER_MAD
+
 _BIN_PX = 0.5  # of wander, whose lines are averaged
 _LEAST_SHARE = 0.1  # of the information, that counts as observed
 _ROUNDS, _SETTLED = 60, 1e-14  # of conjugate gradients; of the first residual, squared
@@ -153,7 +155,7 @@ class WanderGains:
     @property
     def sigma(self) -> float:
         """The usual standard deviation of a gain, relative, by the two halves, and what both err by alike."""
-        return math.hypot(1.4826 * float(self.halved.nanmedian()), _ALIKE)
+        return math.hypot(NORMAL_OVER_MAD * float(self.halved.nanmedian()), _ALIKE)
 
 
 def _solve(means: _Means) -> Float[Tensor, "width channels"]:
