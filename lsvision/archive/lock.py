@@ -14,18 +14,32 @@ with warnings.catch_warnings():
 
 LOCK_FILE = ".lock"
 
+# Whoever asks whether an output is worked on holds its lock for a moment; a run that starts in it is not refused.
+_PATIENCE_S, _POLL_S = 1.0, 0.02
+_TRIALS = 100  # of making a folder that another run may remove, empty as it is, before there is a lock in it
+
 
 def is_worked_on(output: Path) -> bool:
     """Whether a run holds an output; one whose lock cannot be asked for counts as held."""
     if not (output / LOCK_FILE).is_file():
         return False
-    lock = FileLock(output / LOCK_FILE)
+    with lock_if_free(output / LOCK_FILE) as free:
+        return not free
+
+
+@contextmanager
+def lock_if_free(lock_file: Path) -> Iterator[bool]:
+    """Hold a lock for the block if no run does; gives whether it is held. The block is to be short."""
+    lock = FileLock(lock_file)
     try:
         lock.acquire(blocking=False)
     except (Timeout, OSError):
-        return True
-    lock.release()
-    return False
+        yield False
+        return
+    try:
+        yield True
+    finally:
+        lock.release()
 
 
 @contextmanager
@@ -40,14 +54,26 @@ def sole_run(output: Path, lock_file: Path | None = None) -> Iterator[None]:
     Raises:
         ConfigError: another run holds it.
     """
-    path = lock_file or output / LOCK_FILE
-    path.parent.mkdir(parents=True, exist_ok=True)
-    lock = FileLock(path)
+    lock = FileLock(lock_file or output / LOCK_FILE)
     try:
-        lock.acquire(blocking=False)
+        _acquire(lock)
     except Timeout:
         raise ConfigError(f"output: another run is working on {output}; wait for it or choose another") from None
     try:
         yield
     finally:
         lock.release()
+
+
+def _acquire(lock: FileLock) -> None:
+    """Make a lock's folder and take the lock; the run before, ending, may remove the folder between the two."""
+    folder = Path(lock.lock_file).parent
+    for trial in range(_TRIALS):
+        folder.mkdir(parents=True, exist_ok=True)
+        try:
+            lock.acquire(timeout=_PATIENCE_S, poll_interval=_POLL_S)
+        except FileNotFoundError:
+            if trial == _TRIALS - 1:
+                raise
+        else:
+            return

@@ -1,6 +1,7 @@
 """The archive of one scan, worked through in this process."""
 
 import shutil
+import uuid
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -11,14 +12,16 @@ from lsvision.archive.engines.in_process import InProcessEngine
 from lsvision.archive.identity import key_of, stamp_of
 from lsvision.archive.job import WORK_FOLDER, Place
 from lsvision.archive.ledger import LEDGER_FILE, Ledger, measured_cells
-from lsvision.archive.lock import sole_run
+from lsvision.archive.lock import lock_if_free, sole_run
 from lsvision.archive.planned import PlannedScan, Processing, plan_scan
 from lsvision.archive.product import product_path
 from lsvision.archive.sources.calibrations import read_calibrations
 from lsvision.archive.sources.catalogue import SCAN_FILE, Found, name_problem
-from lsvision.errors import ConfigError, LsvisionError
+from lsvision.errors import LsvisionError
 from lsvision.io import MeasuredCells
 from lsvision.types import RefusedVerdict
+
+_ABANDONED = "abandoned"  # work folders on their way out
 
 
 @dataclass(frozen=True)
@@ -76,13 +79,21 @@ def process_one(planned: PlannedScan, processing: Processing, output: Path, prog
 
 
 def _remove_abandoned(own: Path) -> None:
-    """Remove what killed runs of other scans left beside a run's own folder; those at work hold their locks."""
+    """Remove what killed runs of other scans left beside a run's own folder; those at work hold their locks.
+
+    A run of such a scan may start meanwhile: its lock is held no longer than it takes to give the folder another name.
+    """
     others = {path.with_suffix("") for path in own.parent.glob("correct-*")} - {own}
     for folder in others:
         lock = folder.with_suffix(".lock")
-        with suppress(ConfigError, OSError), sole_run(own.parent, lock):
-            shutil.rmtree(folder, ignore_errors=True)
-            lock.unlink()
+        with lock_if_free(lock) as free:
+            if free:
+                with suppress(OSError):
+                    folder.rename(own.parent / f"{_ABANDONED}-{uuid.uuid4().hex}")
+                with suppress(OSError):
+                    lock.unlink()
+    for folder in own.parent.glob(f"{_ABANDONED}-*"):
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 @contextmanager

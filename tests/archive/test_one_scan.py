@@ -2,13 +2,14 @@
 
 import json
 import logging
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
 
-from lsvision.archive import EngineConfig, plan_one, process_one, sole_run
+from lsvision.archive import EngineConfig, one_scan, plan_one, process_one, sole_run
 from lsvision.archive.work import CorrectStrip, FinishProduct
 from lsvision.errors import LsvisionError, ScansFailedError
 from lsvision.experiments.correct import CorrectSettings, run_correct
@@ -119,6 +120,22 @@ def test_what_a_killed_run_left_goes_with_the_next(archive, calibration, tmp_pat
         assert (work / "correct-0123").is_dir()
     process_one(plan_one(archive / "b", calibration, PROCESSING), PROCESSING, tmp_path / "o", ignore)
     assert [path.name for path in (tmp_path / "o").iterdir()] == ["b.zarr"]
+
+
+def test_runs_that_start_and_end_together_do_not_refuse_each_other(tmp_path):
+    """Scans of one output, each in its own thread, as the paper's are: each looks after what the others left."""
+    work = tmp_path / "o" / ".work"
+
+    def start_and_end(name: str) -> None:
+        for _ in range(60):
+            own = work / f"correct-{name}"
+            with sole_run(tmp_path / "o", own.with_suffix(".lock")), one_scan._temporary(own, own.with_suffix(".lock")):
+                one_scan._remove_abandoned(own)
+                assert own.is_dir()
+
+    with ThreadPoolExecutor(8) as pool:
+        list(pool.map(start_and_end, "abcdefgh"))
+    assert not work.exists()
 
 
 def test_a_product_is_replaced_by_one_of_the_same_scan_only(calibration, tmp_path):
