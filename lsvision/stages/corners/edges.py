@@ -42,7 +42,7 @@ def find_edges(scan: Scan, board: Board, corners: BoardCorners, n: Tensor | None
         crossed = same_points(scan.images, left, right, rectification, scan.travel)
     placed = _Placed.of(crossed, scan, rectification)
     seen = crossed.valid & torch.isfinite(placed.points).all(-1)
-    start, stop = (ends[crossed.segment[seen]] for ends in _ends(corners.board_points, board))
+    start, stop = (ends[crossed.segment[seen]] for ends in ends_of_edges(corners.board_points, board))
     return BoardEdges(
         scan=corners.scan,
         points=placed.points[seen],
@@ -105,12 +105,12 @@ def _in_images(corners: BoardCorners, scan: Scan, rectification: Rectification |
 
 
 def _segments(pixels: Tensor, board: Board) -> EdgeSegments:
-    start, stop = _ends(pixels, board)
+    start, stop = ends_of_edges(pixels, board)
     across = torch.linalg.vector_norm(stop - start, dim=-1)[-(board.inner[0] - 1) * board.inner[1] :]
     return EdgeSegments(start, stop, float(across.nanmedian()))
 
 
-def _ends(corners: Tensor, board: Board) -> tuple[Tensor, Tensor]:
+def ends_of_edges(corners: Tensor, board: Board) -> tuple[Tensor, Tensor]:
     """From every corner to the next one along Y, then to the next along X: ``(segments, ..)`` each."""
     grid = corners.unflatten(0, (board.inner[1], board.inner[0]))
     start = torch.cat([grid[:-1].flatten(0, 1), grid[:, :-1].flatten(0, 1)])
