@@ -31,7 +31,7 @@ ONE_PLANE = RawRig(
     RawCamera(113.6, 3569.6, -0.2203, (-0.009, 0.006)),
 )
 TWO_PLANES = replace(ONE_PLANE, view_plane=ViewPlane(0.25, 0.0035, -0.0035))
-PITCH_MM, LINES, TURNS = 0.07, 1024, 5
+PITCH_MM, LINES, TURNS = 0.07, 2560, 4
 ASKED = 1 / 1.15
 CONFIG = CorrectionConfig()
 MATCHING = DisparityConfig()

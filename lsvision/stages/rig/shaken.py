@@ -26,12 +26,13 @@ from lsvision.stages.calibration.config import CalibrationConfig
 from lsvision.stages.calibration.measurements import BoardMeasurements
 from lsvision.stages.calibration.solved import Solution, solve
 from lsvision.stages.rig.config import RigConfig
-from lsvision.stages.rig.sightings import CameraSighting
+from lsvision.stages.rig.sightings import CameraSighting, Sightings
 from lsvision.stages.rig.solve import RigSolution, fit_rig, noise_scale_of
 from lsvision.types import ErrorAlongScan
 
 _ROUNDS = 2
 _SUSPECT = 1.2  # noise scale from which lines may have moved
+_MOST_OUTLIERS = 0.02  # of the corners: more were left out because a model without motion does not fit
 
 
 @dataclass(frozen=True)
@@ -42,19 +43,34 @@ class ShakenSolution:
     errors: tuple[ErrorAlongScan, ...]
 
 
-def allow_for_line_motion(solution: RigSolution, config: RigConfig) -> ShakenSolution:
-    """The solution of one problem again, with the motion of its boards' lines where the corners show one."""
+def allow_for_line_motion(solution: RigSolution, sightings: Sightings, config: RigConfig) -> ShakenSolution:
+    """The solution of one problem again, with the motion of its boards' lines where the corners show one.
+
+    Args:
+        sightings: all corners: those that a vibration displaces most are no outliers.
+    """
     errors: tuple[ErrorAlongScan, ...] = ()
     if float(solution.noise_scale) < _SUSPECT or not bool(solution.found.converged):
         return ShakenSolution(solution, errors)
+    still = solution
+    if int(still.outliers.sum()) > _MOST_OUTLIERS * int(sightings.valid.sum()):
+        solution = replace(still, sightings=sightings, outliers=torch.zeros_like(still.outliers))
     for _ in range(_ROUNDS):
         options = CalibrationConfig(prior_sigma=config.motion_sigma, correlated_odds=config.correlated_odds)
         by_points = solve(_measured(solution), options)
         if not bool(by_points.along_scan.found):
             break
         errors = errors_along_scan_of(by_points.summary())
+        solution = _without_left_out(solution, by_points)
         solution = _fitted_again(solution, _along(solution, by_points), config)
-    return ShakenSolution(solution, errors)
+    return ShakenSolution(solution if errors else still, errors)
+
+
+def _without_left_out(solution: RigSolution, by_points: Solution) -> RigSolution:
+    """The solution less the corners that the search for the motion left out: it says nothing of how they moved."""
+    left_out = solution.sightings.valid & ~by_points.problem.valid
+    kept = replace(solution.sightings, valid=solution.sightings.valid & ~left_out)
+    return replace(solution, sightings=kept, outliers=solution.outliers + left_out.sum(-1))
 
 
 def _fitted_again(solution: RigSolution, along: Float[Tensor, "boards rows rows"], config: RigConfig) -> RigSolution:
