@@ -64,14 +64,22 @@ class LineCamera:
         return _turned(self._distorted(t), torch.tan(self.turn))
 
     def column(self, slope: Float[Tensor, "*columns"]) -> Float[Tensor, "*columns"]:
-        """Column, px, that looks along a slope dx/dz: the inverse of ``slope``, by Newton's method."""
+        """Column, px, that looks along a slope dx/dz: the inverse of ``slope``, by Newton's method.
+
+        Only the last step is differentiated, once: at the solution that is the derivative of the inverse.
+        """
         distorted = _turned(slope, -torch.tan(self.turn))
-        t = distorted
-        for _ in range(_INVERSIONS):
-            square = t.square()
-            growth = 1 + square * (3 * self.k1 + 5 * self.k2 * square)
-            t = t - (self._distorted(t) - distorted) / growth
-        return t * self.focal_px + self.principal_px
+        t = fixed = distorted.detach()
+        without_derivatives = replace(self, k1=self.k1.detach(), k2=self.k2.detach())
+        for _ in range(_INVERSIONS - 1):
+            t = without_derivatives._nearer(t, fixed)
+        return self._nearer(t, distorted) * self.focal_px + self.principal_px
+
+    def _nearer(self, t: Tensor, distorted: Tensor) -> Tensor:
+        """One of Newton's steps towards the place that is distorted to another."""
+        square = t.square()
+        growth = 1 + square * (3 * self.k1 + 5 * self.k2 * square)
+        return t - (self._distorted(t) - distorted) / growth
 
     def _distorted(self, t: Tensor) -> Tensor:
         square = t.square()
