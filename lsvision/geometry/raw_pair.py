@@ -8,7 +8,7 @@ Source: the distortion of Brown 1971, along the one axis of a line; the motion o
 """
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import torch
 from jaxtyping import Float
@@ -66,17 +66,18 @@ class LineCamera:
     def column(self, slope: Float[Tensor, "*columns"]) -> Float[Tensor, "*columns"]:
         """Column, px, that looks along a slope dx/dz: the inverse of ``slope``, by Newton's method.
 
-        Only the last step is differentiated, once: at the solution that is the derivative of the inverse.
+        The last step alone is differentiated: at the root it has the first derivatives of the inverse, and derivatives
+        by twenty unknowns cost half the time.
         """
         distorted = _turned(slope, -torch.tan(self.turn))
-        t = fixed = distorted.detach()
-        without_derivatives = replace(self, k1=self.k1.detach(), k2=self.k2.detach())
+        still = LineCamera(*(getattr(self, item.name).detach() for item in fields(self)))
+        t = there = distorted.detach()
         for _ in range(_INVERSIONS - 1):
-            t = without_derivatives._nearer(t, fixed)
+            t = still._nearer(t, there)
         return self._nearer(t, distorted) * self.focal_px + self.principal_px
 
     def _nearer(self, t: Tensor, distorted: Tensor) -> Tensor:
-        """One of Newton's steps towards the place that is distorted to another."""
+        """A Newton step of the distortion's inverse."""
         square = t.square()
         growth = 1 + square * (3 * self.k1 + 5 * self.k2 * square)
         return t - (self._distorted(t) - distorted) / growth

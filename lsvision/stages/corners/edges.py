@@ -37,7 +37,7 @@ def find_edges(scan: Scan, board: Board, corners: BoardCorners) -> BoardEdges | 
     points = torch.stack([x, travel_at(scan.travel, line.double()), z], dim=-1)
     seen = in_left.valid & in_right.valid & (in_left.step * in_right.step > 0) & torch.isfinite(points).all(-1)
     by_left, by_disparity = triangulation_jacobian(scan.rig, in_left.column, disparity).unbind(-1)
-    start, stop = (ends[segment[seen]] for ends in _ends(corners.board_points, board))
+    start, stop = (ends[segment[seen]] for ends in ends_of_edges(corners.board_points, board))
     return BoardEdges(
         scan=corners.scan,
         points=points[seen],
@@ -51,12 +51,12 @@ def find_edges(scan: Scan, board: Board, corners: BoardCorners) -> BoardEdges | 
 
 
 def _segments(pixels: Tensor, board: Board) -> EdgeSegments:
-    start, stop = _ends(pixels, board)
+    start, stop = ends_of_edges(pixels, board)
     across = torch.linalg.vector_norm(stop - start, dim=-1)[-(board.inner[0] - 1) * board.inner[1] :]
     return EdgeSegments(start, stop, float(across.nanmedian()))
 
 
-def _ends(corners: Tensor, board: Board) -> tuple[Tensor, Tensor]:
+def ends_of_edges(corners: Tensor, board: Board) -> tuple[Tensor, Tensor]:
     """From every corner to the next one along Y, then to the next along X: ``(segments, ..)`` each."""
     grid = corners.unflatten(0, (board.inner[1], board.inner[0]))
     start = torch.cat([grid[:-1].flatten(0, 1), grid[:, :-1].flatten(0, 1)])

@@ -49,7 +49,7 @@ def test_heights_are_known_as_well_as_was_asked_for(boards, most_um):
     truth = Truth.drawn(6)
     found = solve_rig(truth.scanned(boards), PRIOR, CONFIG)
     bends = 1e3 * shape_at(truth).bend_mm((found.shared.vector - truth.vector) / PRIOR.sigma)
-    stated = 1e3 * float(shape_at(truth).stated_mm(found.found.factor[0]))
+    stated = 1e3 * float(shape_at(truth).stated_mm(found.factor[0]))
     assert float(bends.square().mean().sqrt()) < most_um
     assert 0.4 * stated < float(bends.square().mean().sqrt()) < 1.6 * stated
 
