@@ -37,6 +37,11 @@ class Periodograms:
         """Of a segment."""
         return self.windows[0].shape[-1] // 2
 
+    @property
+    def segments(self) -> int:
+        """Into which the signal was cut."""
+        return len(self.windows[0])
+
     @classmethod
     def of(cls, data: SharedSignal) -> "Periodograms":
         """Those of a signal, in segments side by side where it is long."""

@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from lsvision.estimation.filtering import StateSpace, filter_sequence
+from lsvision.estimation.filtering import StateSpace, Track, filter_sequence
 from lsvision.estimation.gaussian import Gaussian
 from lsvision.estimation.linalg import apply
 from lsvision.estimation.smoothing import smooth
@@ -57,23 +57,24 @@ class SharedModel:
 
     def state_space(self, data: SharedSignal) -> tuple[StateSpace, Gaussian]:
         """The model for the filter, and the state before the first sample: all processes, and a one sample before."""
-        processes, like = [*self.a, *self.b], data.total
-        F, Q, start = (
-            torch.block_diag(*(getattr(process, part) for process in processes), like.new_zeros(1, 1))
-            for part in ("transition", "noise_root", "start_root")
-        )
-        of_a, of_b = self.row(0), self.row(1)
-        F[-1] = of_a
-        start[-1, -1] = (of_a @ start).norm()
-        before = torch.zeros_like(of_a)
-        before[-1] = 1.0
-        H = torch.stack([of_a + of_b, data.ratio * (of_a - before)])
-        valid = torch.stack([data.total_valid, data.difference_valid], -1)
-        sigma = like.new_tensor([data.total_sigma, data.difference_sigma])
-        noise = torch.diag_embed(torch.where(valid, sigma, _UNKNOWN * sigma))
-        space = StateSpace(lambda points, _: apply(H, points), noise, Q, lambda points: apply(F, points))
-        batch = data.total.shape[1:]
-        return space, Gaussian(F.new_zeros(*batch, len(F)), start.expand(*batch, *start.shape))
+        return _state_space([self], data, data.total.shape[1:])
+
+    def matrices(self) -> tuple[Tensor, Tensor]:
+        """What takes all processes, and a one sample before, to the next sample; the factor of the noise on the way."""
+        transition, noise = (self._blocks(part) for part in ("transition", "noise_root"))
+        transition[-1] = self.row(0)
+        return transition, noise
+
+    def start(self) -> Float[Tensor, "state state"]:
+        """Factor of the covariance before the first sample."""
+        start = self._blocks("start_root")
+        start[-1, -1] = (self.row(0) @ start).norm()
+        return start
+
+    def _blocks(self, part: str) -> Tensor:
+        processes = [*self.a, *self.b]
+        of_before = processes[0].transition.new_zeros(1, 1)
+        return torch.block_diag(*(getattr(process, part) for process in processes), of_before)
 
     def row(self, which: int) -> Float[Tensor, " state"]:
         """What of the state adds up to a (0) or b (1)."""
@@ -84,6 +85,43 @@ class SharedModel:
             row[place] = float((index >= len(self.a)) == bool(which))
             place += process.size
         return row
+
+
+def innovations_of(models: Sequence[SharedModel], data: SharedSignal) -> Track:
+    """Filter one signal by several models of equally many processes at once; the batch is that of the models.
+
+    Args:
+        data: one sequence.
+    """
+    values, seen = _values_of(data)
+    count = len(models)
+    space, start = _state_space(models, data.at(torch.arange(len(data.total))[:, None].expand(-1, count)), (count,))
+    return filter_sequence(
+        space, start, values[:, None].expand(-1, count, -1), seen[:, None].expand(-1, count), history=False
+    )
+
+
+def _values_of(data: SharedSignal) -> tuple[Tensor, Tensor]:
+    """The measured pairs (m, d), and where there is any."""
+    valid = torch.stack([data.total_valid, data.difference_valid], -1)
+    return torch.where(valid, torch.stack([data.total, data.difference], -1), 0.0), valid.any(-1)
+
+
+def _state_space(
+    models: Sequence[SharedModel], data: SharedSignal, batch: Sequence[int]
+) -> tuple[StateSpace, Gaussian]:
+    """One model for all of a batch, or as many as it has problems."""
+    F, Q = (torch.stack(part).squeeze(0) for part in zip(*(model.matrices() for model in models), strict=True))
+    start = torch.stack([model.start() for model in models]).squeeze(0)
+    of_a, of_b = models[0].row(0), models[0].row(1)
+    before = torch.zeros_like(of_a)
+    before[-1] = 1.0
+    H = torch.stack([of_a + of_b, data.ratio * (of_a - before)])
+    valid = torch.stack([data.total_valid, data.difference_valid], -1)
+    sigma = data.total.new_tensor([data.total_sigma, data.difference_sigma])
+    noise = torch.diag_embed(torch.where(valid, sigma, _UNKNOWN * sigma))
+    space = StateSpace(lambda points, _: apply(H, points), noise, Q, lambda points: apply(F, points))
+    return space, Gaussian(F.new_zeros(*batch, len(H[0])), start.expand(*batch, *start.shape[-2:]))
 
 
 def smooth_shares(
@@ -101,10 +139,9 @@ def smooth_shares(
     means, variances = [], []
     for group in torch.arange(0, samples, block).split(_BLOCKS_AT_ONCE):
         blocks = data.at(within + group)
-        valid = torch.stack([blocks.total_valid, blocks.difference_valid], -1)
-        values = torch.where(valid, torch.stack([blocks.total, blocks.difference], -1), 0.0)
+        values, seen = _values_of(blocks)
         space, start = model.state_space(blocks)
-        posterior = smooth(filter_sequence(space, start, values, valid.any(-1)), space)
+        posterior = smooth(filter_sequence(space, start, values, seen), space)
         inner = slice(halo, halo + block)
         row = (of_b[:, None] * posterior.factor[inner]).sum(-2)
         means.append(apply(of_b[None], posterior.mean[inner])[..., 0].T.flatten())

@@ -2,7 +2,7 @@
 
 Both processes, a and b, are sums of a broad part, Matérn of smoothness 3/2 with a length of its own, and of waves,
 which have the same wavelength and coherence in a and b. Waves are added one by one, where the periodogram of m exceeds
-its expectation most.
+its expectation most. Waves that periodograms do not separate are found afterwards (``shared_neighbours``).
 """
 
 import math
@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from lsvision.estimation.shared_neighbours import with_neighbours
 from lsvision.estimation.shared_parts import Part
 from lsvision.estimation.shared_periodograms import Periodograms
 from lsvision.estimation.shared_signal import SharedModel, SharedSignal
@@ -57,7 +58,10 @@ def fit_shares(data: SharedSignal, sigma: float, length: float) -> SharedFit:
     fits = [_grown(waves, _fitted(waves, (usual,), _BOTH)), _grown(waves, _Fit((faint,), -math.inf))]
     both = max(fits, key=lambda fit: fit.density)
     alone = [_fitted(waves, both.parts, kept).density for kept in ((False, True), (True, False))]
-    return SharedFit(both.parts, (both.density - alone[0], both.density - alone[1]))
+    evidence = both.density - alone[0], both.density - alone[1]
+    # The longer a signal, the fewer waves lie within a cycle of each other.
+    parts = both.parts if waves.segments > 1 else with_neighbours(both.parts, data)
+    return SharedFit(parts, evidence)
 
 
 @dataclass(frozen=True)

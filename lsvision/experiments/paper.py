@@ -6,25 +6,22 @@ both calibrations, and one board shaken as the paper's figures suggest is calibr
 """
 
 import logging
-from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
-import torch
 from annotated_types import MinLen
 
 from lsvision.archive import Processing, plan_one
-from lsvision.experiments.calibrate import calibrate_with_edges
 from lsvision.experiments.correct import make_product
+from lsvision.experiments.paper_lines import ShakenScans, check_board, in_memory
 from lsvision.experiments.parallel import map_names, scan_pool
 from lsvision.experiments.settings import RunSettings
 from lsvision.experiments.simulate import write_simulation
-from lsvision.geometry import displace, scaled_rig
-from lsvision.image.tiling import one_torch_thread
+from lsvision.geometry import scaled_rig
 from lsvision.io import Product, read_product, read_scan, write_calibration, write_json
 from lsvision.report.paper_pages import write_paper_report
-from lsvision.report.paper_scenario import HELD_OUT, PAPER, BoardCheck, Scenario, Trial
+from lsvision.report.paper_scenario import HELD_OUT, NOMINAL, PAPER, Scenario, Trial
 from lsvision.report.progress import ProgressBars, progress_bars
 from lsvision.schema import Positive, Scale
 from lsvision.simulation import (
@@ -39,19 +36,15 @@ from lsvision.simulation import (
 from lsvision.simulation.sheet_points import points_in_product, points_in_scan
 from lsvision.stages.calibration.calibrate import calibrate
 from lsvision.stages.calibration.config import CalibrationConfig
-from lsvision.stages.calibration.known_motion import calibrate_lines
 from lsvision.stages.corners.config import CornersConfig
-from lsvision.stages.corners.edges import find_edges
 from lsvision.stages.corners.find import find_corners
 from lsvision.stages.correction.config import CorrectionConfig
 from lsvision.stages.disparity.config import DisparityConfig
 from lsvision.stages.disparity.depth import depth_of
-from lsvision.stages.measurement import distance_errors, fitted_rmse_mm, measure_board
-from lsvision.types import Board, BoardCorners, Calibration, Rig, Scan, TensorImage
+from lsvision.stages.measurement import fitted_rmse_mm
+from lsvision.types import Board, Calibration, Rig, Scan
 
 log = logging.getLogger(__name__)
-
-NOMINAL = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)  # motion n
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -147,7 +140,7 @@ def _scenario(settings: PaperSettings, motion: MotionConfig, folder: Path, bars:
             return read_product(make_product(planned, processing, folder, bars).path)
 
         products = map_names(pool, corrected, scans)
-        checks = map_names(pool, lambda name: _check_board(settings.board, corners[name], products[name]), boards)
+        checks = map_names(pool, lambda name: check_board(settings.board, corners[name], products[name]), boards)
     sheet = simulations["sheet"]
     n_true = sheet.trajectory.n
 
@@ -155,10 +148,13 @@ def _scenario(settings: PaperSettings, motion: MotionConfig, folder: Path, bars:
         return Trial(result, n_true, fitted_rmse_mm(corners[HELD_OUT], result.motion.n))
 
     trials = {"joint": tried(joint), "two_step": tried(two_step)}
+    steadied = None
     if joint.errors_along_scan:
-        trials["joint with line motion"] = _with_line_motion(settings, scans, corners, n_true)
-        write_calibration(trials["joint with line motion"].result, folder / "calibration_line_motion.json")
-    color, height = _in_memory(products["sheet"])
+        lines = replace(settings.joint, line_motion="auto")
+        shaken = ShakenScans(folder, settings.board, scans, corners, sheet, lines, processing)
+        steadied = shaken.steadied(settings.threads, bars)
+        trials["joint with line motion"] = steadied.trial
+    color, height = in_memory(products["sheet"])
     return Scenario(
         trials=trials,
         held_out_before_mm=fitted_rmse_mm(corners[HELD_OUT], NOMINAL),
@@ -168,25 +164,8 @@ def _scenario(settings: PaperSettings, motion: MotionConfig, folder: Path, bars:
         sheet_after=points_in_product(color, height, products["sheet"].grid, joint.motion.n, sheet),
         scans=scans,
         products=products,
+        steadied=steadied,
     )
-
-
-def _with_line_motion(
-    settings: PaperSettings, scans: Mapping[str, Scan], corners: Mapping[str, BoardCorners], n_true: torch.Tensor
-) -> Trial:
-    """The joint calibration of shaken boards with the motion of their lines.
-
-    The board that is held out is fitted under its n, with the motion of its own lines.
-    """
-    config = replace(settings.joint, line_motion="auto")
-    seen = [name for name in corners if name != HELD_OUT]
-    boards = [corners[name] for name in seen]
-    result = calibrate_with_edges([scans[name] for name in seen], boards, settings.board, config)
-    held_out = corners[HELD_OUT]
-    edges = find_edges(scans[HELD_OUT], settings.board, held_out)
-    with one_torch_thread():
-        own = calibrate_lines(held_out, edges, result.motion.n, scans[HELD_OUT].rig, config)
-    return Trial(result, n_true, own.rmse_after_mm)
 
 
 def _simulations(settings: PaperSettings, motion: MotionConfig) -> dict[str, Simulation]:
@@ -209,27 +188,3 @@ def _simulations(settings: PaperSettings, motion: MotionConfig) -> dict[str, Sim
         )
         for index, (name, scene) in enumerate(scenes.items())
     }
-
-
-def _check_board(board: Board, corners: BoardCorners, product: Product) -> BoardCheck:
-    """Distances between a board's corners at nominal motion and in the product."""
-    nominal = displace(corners.points, NOMINAL)
-    neighbours_mm, pairs_mm = distance_errors(nominal, board, corners.valid)
-    color, height = _in_memory(product)
-    measured = measure_board(color, height, product.grid, board)
-    if measured is None:
-        return BoardCheck(0, neighbours_mm, pairs_mm)
-    return BoardCheck(
-        corners=int(measured.valid.sum()),
-        neighbours_before_mm=neighbours_mm,
-        pairs_before_mm=pairs_mm,
-        neighbours_after_mm=measured.neighbour_rms_mm,
-        pairs_after_mm=measured.distance_rms_mm,
-        points=measured.points,
-    )
-
-
-def _in_memory(product: Product) -> tuple[TensorImage, TensorImage]:
-    """Colour and height of a whole product."""
-    rows = product.grid.rows
-    return TensorImage(product.color(0, rows)), TensorImage(product.height(0, rows)[..., None])

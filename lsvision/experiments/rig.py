@@ -8,7 +8,14 @@ from lsvision import __version__
 from lsvision.errors import ConfigError, UnusableCalibrationError
 from lsvision.experiments.calibrate import alignment, locate_boards, read_scans
 from lsvision.experiments.settings import RunSettings, settings_sha256
-from lsvision.io import read_raw_rig, scan_sha256, write_raw_rig, write_rig_calibration
+from lsvision.io import (
+    copy_response,
+    read_raw_rig,
+    rig_file,
+    scan_sha256,
+    write_raw_rig,
+    write_rig_calibration,
+)
 from lsvision.report.rig_pages import rig_report, rig_summary
 from lsvision.schema import Text
 from lsvision.stages.installation.config import InstallationConfig
@@ -24,6 +31,8 @@ log = logging.getLogger(__name__)
 class RigSettings(RunSettings):
     """Options of the experiment; ``data_sheet`` is the file of the rig to start from, that of the first scan if None.
 
+    A rig that was calibrated before is known by its full covariance: its boards count again with those of the scans.
+    The cameras' responses are those that the data sheet names, or else the first scan's rig.
     A scan without some of its frames or Zarr chunks is refused; with ``missing_lines`` "mark" the corners on their
     lines are not measured.
     """
@@ -37,7 +46,7 @@ class RigSettings(RunSettings):
 
 
 def run_rig(settings: RigSettings, folder: Path) -> None:
-    """Find the board in both images of every scan, calibrate, write the rig, its covariance and a report.
+    """Find the board in both images of every scan, calibrate, write the rig, its responses, covariance and a report.
 
     Raises:
         UnusableCalibrationError: the scans contradict each other or the estimate did not converge; its files are
@@ -45,6 +54,7 @@ def run_rig(settings: RigSettings, folder: Path) -> None:
     """
     scans = read_scans(settings.scans, settings.missing_lines)
     start = _data_sheet(scans[0], settings.data_sheet)
+    responses = _kept_responses(scans[0], settings.data_sheet, folder)
     sightings = find_sightings(scans, settings.board)
     calibration = calibrate_rig(sightings, [str(scan.path) for scan in scans], start, settings.estimate)
     provenance = Provenance(
@@ -55,7 +65,7 @@ def run_rig(settings: RigSettings, folder: Path) -> None:
     guide = alignment(calibration, scans, settings.estimate.motion_sigma, settings.installation)
     calibration = replace(calibration, provenance=provenance, installation=guide)
     write_rig_calibration(calibration, folder / "rig_calibration.json")
-    write_raw_rig(calibration.rig, folder / "rig.yaml")
+    write_raw_rig(calibration.rig, folder / "rig.yaml", responses)
     rig_report(calibration, start, asdict(settings), folder)
     log.info("%s\nwrote %s and %s", rig_summary(calibration), folder / "rig.yaml", folder / "report.html")
     if not calibration.usable:
@@ -74,6 +84,11 @@ def find_sightings(scans: list[Scan], board: Board) -> Sightings:
             raise ConfigError(f"scans: {scan.path} has a depth map in place of the right image")
         parts.append(sighted(located.left, located.right, scan.travel, board))
     return joined(parts)
+
+
+def _kept_responses(scan: Scan, data_sheet: str | None, folder: Path) -> dict[str, str]:
+    of_sheet = {} if data_sheet is None else copy_response(Path(data_sheet), folder)
+    return of_sheet or copy_response(rig_file(scan.path), folder)
 
 
 def _data_sheet(scan: Scan, path: str | None) -> RawRig:

@@ -25,25 +25,12 @@ def axes_not_studied() -> dict[str, list[float | int] | None]:
     return {item.name: None for item in fields(RigConditions)}
 
 
-def usual_deviations() -> RigSigmas:
-    """How far cameras are from their data sheet, as a rule."""
-    return RigSigmas(
-        focal_length_share=0.005,
-        principal_sigma_px=1.0,
-        turn_sigma_deg=0.3,
-        distortion_sigma=0.02,
-        baseline_share=0.001,
-        plane_sigma_mm=0.3,
-        plane_slope_sigma=0.0035,
-        motion_sigma=0.02,
-    )
-
-
 @dataclass(frozen=True, kw_only=True)
 class StudyRigSettings(RunSettings):
     """Options of the experiment.
 
-    ``data_sheet`` is the prior, with the sigmas of ``estimate``; the true rigs differ from it by those of ``drawn``.
+    ``data_sheet`` is the prior, with the sigmas of ``estimate``; the true rigs differ from it by those of ``drawn``,
+    the same unless others are named: a calibration that expects other rigs than it gets cannot reach the bound.
     ``conditions`` are what every point has but for the ``axes``: lists of values by name
     of a condition, whose grid is studied. ``runs`` rigs are drawn and calibrated per point.
     """
@@ -53,7 +40,7 @@ class StudyRigSettings(RunSettings):
     board: Board
     estimate: RigConfig
     conditions: RigConditions
-    drawn: RigSigmas = field(default_factory=usual_deviations)
+    drawn: RigSigmas = field(default_factory=RigSigmas)
     axes: dict[str, list[float | int] | None] = field(default_factory=axes_not_studied)
     runs: PositiveInt = 100
 

@@ -8,7 +8,7 @@ Source: the distortion of Brown 1971, along the one axis of a line; the motion o
 """
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import torch
 from jaxtyping import Float
@@ -64,14 +64,23 @@ class LineCamera:
         return _turned(self._distorted(t), torch.tan(self.turn))
 
     def column(self, slope: Float[Tensor, "*columns"]) -> Float[Tensor, "*columns"]:
-        """Column, px, that looks along a slope dx/dz: the inverse of ``slope``, by Newton's method."""
+        """Column, px, that looks along a slope dx/dz: the inverse of ``slope``, by Newton's method.
+
+        The last step alone is differentiated: at the root it has the first derivatives of the inverse, and derivatives
+        by twenty unknowns cost half the time.
+        """
         distorted = _turned(slope, -torch.tan(self.turn))
-        t = distorted
-        for _ in range(_INVERSIONS):
-            square = t.square()
-            growth = 1 + square * (3 * self.k1 + 5 * self.k2 * square)
-            t = t - (self._distorted(t) - distorted) / growth
-        return t * self.focal_px + self.principal_px
+        still = LineCamera(*(getattr(self, item.name).detach() for item in fields(self)))
+        t = there = distorted.detach()
+        for _ in range(_INVERSIONS - 1):
+            t = still._nearer(t, there)
+        return self._nearer(t, distorted) * self.focal_px + self.principal_px
+
+    def _nearer(self, t: Tensor, distorted: Tensor) -> Tensor:
+        """A Newton step of the distortion's inverse."""
+        square = t.square()
+        growth = 1 + square * (3 * self.k1 + 5 * self.k2 * square)
+        return t - (self._distorted(t) - distorted) / growth
 
     def _distorted(self, t: Tensor) -> Tensor:
         square = t.square()

@@ -13,7 +13,7 @@ from lsvision.io.formats.raw_rig import (
     read_rig_pair,
     write_raw_rig,
 )
-from lsvision.io.formats.response import read_response, write_response, write_rig_with_response
+from lsvision.io.formats.response import copy_response, read_response, write_response, write_rig_with_response
 from lsvision.io.formats.rig import read_rig, rig_from_dict, rig_to_dict, write_rig
 from lsvision.io.formats.rig_calibration import write_rig_calibration
 from lsvision.io.formats.rig_match import check_rig_match, rig_difference
@@ -46,6 +46,7 @@ __all__ = [
     "check_product",
     "check_rig_match",
     "complete_product",
+    "copy_response",
     "create_product",
     "export_product",
     "finite_or_null",

@@ -2,7 +2,8 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -15,6 +16,7 @@ from lsvision.types import BoardCorners, Calibration, Scan
 # Wang et al. 2024, section 5: RMSE before and after, its improvement, iterations and stretch.
 PAPER = {"rmse_before_mm": 2.059, "rmse_after_mm": 0.8794, "improvement": 0.573, "iterations": 5, "stretch": 1.0246}
 
+NOMINAL = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)  # motion n
 HELD_OUT = "held_out"  # the scan of a board that calibrates nothing
 
 
@@ -65,6 +67,46 @@ class BoardCheck:
 
 
 @dataclass(frozen=True)
+class SheetCheck:
+    """Rms error of points of the sheet in a product, mm, in all, and along X, Y and Z of the sheet.
+
+    ``not_seen`` names the components of the motion from line to line that were not observed.
+    """
+
+    points: int
+    rms_mm: float
+    by_axis_mm: tuple[float, ...]
+    not_seen: tuple[str, ...]
+
+    @classmethod
+    def of(cls, points: SheetPoints, line_motion: Mapping[str, Any]) -> "SheetCheck":
+        """That of the points in a product, of whose metadata ``line_motion`` is an entry."""
+        error = points.measured_mm - points.true_mm
+        found = line_motion.get("components", ())
+        not_seen = tuple(each["component"] for each in found if each["state"] == "not observed")
+        return cls(len(error), points.rms_mm, tuple(error.square().mean(0).sqrt().tolist()), not_seen)
+
+
+@dataclass(frozen=True)
+class Steadied:
+    """A scenario with the motion from line to line taken away: the calibration, boards by name, the sheet by source."""
+
+    trial: Trial
+    checks: Mapping[str, BoardCheck]
+    sheets: Mapping[str, SheetCheck]
+
+    def summary(self) -> dict:
+        """Plain values for ``summary.json``."""
+        return {
+            "board_distance_rms_mm": {
+                name: {"corners": check.corners, "before": check.pairs_before_mm, "after": check.pairs_after_mm}
+                for name, check in self.checks.items()
+            },
+            "sheet": {source: asdict(check) for source, check in self.sheets.items()},
+        }
+
+
+@dataclass(frozen=True)
 class Scenario:
     """Everything that one scenario produced, by name of the scan or of the method.
 
@@ -79,6 +121,7 @@ class Scenario:
     sheet_after: SheetPoints
     scans: Mapping[str, Scan]
     products: Mapping[str, Product]
+    steadied: Steadied | None = None
 
     def summary(self) -> dict:
         """Plain values for ``summary.json``."""
@@ -95,7 +138,8 @@ class Scenario:
                 "points": len(self.sheet_after.shift_px),
             },
         }
-        return {**methods, "held_out_rmse_before_mm": self.held_out_before_mm, "products": products}
+        steadied = {} if self.steadied is None else {"with_line_motion": self.steadied.summary()}
+        return {**methods, "held_out_rmse_before_mm": self.held_out_before_mm, "products": products, **steadied}
 
     def image(self, name: str) -> Tensor:
         """The whole left image of a scan."""

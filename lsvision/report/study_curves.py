@@ -46,4 +46,6 @@ def omitted_curves(points: polars.DataFrame, conditions: Sequence[str]) -> str:
 def _in_words(name: str, value: object) -> str:
     if name in ("boards", "method"):
         return str(value).replace("_", " ")
+    if name == "line_motion":
+        return "lines measured" if value == "auto" else "corners alone"
     return f"{name} {value:g}" if isinstance(value, float) else f"{name} {value}"

@@ -37,8 +37,6 @@ AXIS_LABELS = {
     "board_count": "boards scanned [count]",
     "tilt_spread_deg": "largest angle between two boards [deg]",
 }
-# Conditions that the calibration does not know and has to detect.
-DISTURBANCES = ("vibration_mm", "vibration_wavelength_mm", "encoder_mm", "encoder_wavelength_mm")
 _COMPONENTS = ("n1, sideways", "n2, along", "n3, in depth")
 _FEW_STEPS = 8  # iterations over which the contraction of a slow method is averaged
 _SHARES = (0.002, 0.005, 0.01, 0.02, 0.05, 0.5)  # contours of the map, in shares of the prior's sigma
@@ -87,29 +85,6 @@ def accuracy(points: polars.DataFrame, axis: str, others: tuple[str, ...]) -> Re
         caption + omitted_curves(points, others),
         figure,
     )
-
-
-def coverage(points: polars.DataFrame, axis: str, others: tuple[str, ...]) -> ReportFigure:
-    """Normalised squared error of n over one disturbance, and the share of runs that noticed it."""
-    figure, axes = new_figure(9.5, 4.2, 1, 2)
-    for curve in curves_by(points, others):
-        own = curve.points.sort(axis)
-        for panel, name, label in ((axes[0], "nees", curve.label), (axes[1], "along_scan", None)):
-            panel.plot(own[axis], own[name], curve.marker, ls="-", ms=4, color=curve.color, label=label)
-    axes[0].axhline(3.0, color=TRUTH, linewidth=1, label="a right covariance")
-    axes[0].set_yscale("log")
-    show_a_decade(axes[0])
-    label_axes(axes[0], "Errors over stated σ", AXIS_LABELS[axis], "mean normalised squared error [ratio]")
-    label_axes(axes[1], "Runs that found errors along the scan", AXIS_LABELS[axis], "share of the runs [ratio]")
-    axes[1].set_ylim(-0.05, 1.05)
-    figure.legend(loc="outside lower center", ncols=3, fontsize=8)
-    caption = (
-        "Left: 3 where the stated covariance is right, above where n is farther off than it says, below where it says "
-        "too much. Waves longer than a board look like n; those of a few lines average out. Right: how many runs found "
-        "the disturbance and allowed for it; what too few find is not in σ."
-    )
-    title = f"Does σ cover it: {AXIS_LABELS[axis].split(' [')[0]}"
-    return ReportFigure(f"coverage_{axis}", title, caption + omitted_curves(points, others), figure)
 
 
 def placings(points: polars.DataFrame) -> ReportFigure:

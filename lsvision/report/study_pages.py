@@ -8,14 +8,13 @@ import polars
 
 from lsvision.estimation import mean_chi_square_band
 from lsvision.report.pages import Headline, Page, ReportFigure, Table, cell_text, write_report
+from lsvision.report.study_disturbances import DISTURBANCES, coverage, what_is_left
 from lsvision.report.study_figures import (
     AXIS_LABELS,
-    DISTURBANCES,
     TiltMap,
     accuracy,
     consistency,
     convergence,
-    coverage,
     placings,
     tilt_map,
     truth_and_estimate,
@@ -92,7 +91,10 @@ def _figures(study: Study) -> list[ReportFigure]:
     if "angle_z_deg" in axes:
         figures.append(truth_and_estimate(study.runs, points, study.axes_without("angle_z_deg")))
     figures += [accuracy(points, name, study.axes_without(name)) for name in axes if name in AXIS_LABELS]
-    figures += [coverage(points, name, study.axes_without(name)) for name in axes if name in DISTURBANCES]
+    disturbances = [name for name in axes if name in DISTURBANCES]
+    figures += [coverage(points, name, study.axes_without(name)) for name in disturbances]
+    if "line_motion" in axes:
+        figures += [what_is_left(points, name, study.axes_without(name)) for name in disturbances]
     if "boards" in axes:
         of_boards = [name for name in _OF_BOARDS if points[name].n_unique() > 1]
         figures += [accuracy(points, name, study.axes_without("boards")) for name in of_boards]

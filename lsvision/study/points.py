@@ -14,7 +14,8 @@ from lsvision.simulation import Acquisition, BoardPose, MotionConfig, SceneConfi
 from lsvision.stages.calibration.config import CalibrationConfig
 from lsvision.stages.calibration.linearise import motion_information
 from lsvision.stages.calibration.problem import BoardProblem, BoardState, nominal_problem
-from lsvision.types import Board, CalibrationMethod, Rig
+from lsvision.study.edges import exact_edges
+from lsvision.types import Board, BoardEdges, CalibrationMethod, Rig, WhetherLineMotion
 
 # Of the simulated scan; corners are taken between its lines, so that it rounds nothing.
 _LINE_PITCH_MM = 0.07
@@ -26,7 +27,9 @@ class Conditions(Checked):
 
     ``corner_sigma_mm`` is the white noise of x and of the travel, ``depth_sigma_mm`` that of z; the calibration knows
     both. It does not know the vibration of x and z or the encoder's error, and has to detect them: sine waves of a
-    given rms, with new phases in every scan.
+    given rms, with new phases in every scan. With ``line_motion`` "auto" it sees the edges of the squares besides, as
+    exact as the corners, and the motion from line to line that it finds is part of the result; with "none" it has the
+    corners alone, and what it finds is noise.
     """
 
     boards: Text
@@ -42,12 +45,14 @@ class Conditions(Checked):
     prior_sigma: Positive = 0.05
     method: CalibrationMethod = "joint"
     iterations: PositiveInt = 20
+    line_motion: WhetherLineMotion = "none"
 
     def calibration(self, config: CalibrationConfig) -> CalibrationConfig:
         """The calibration's options with those of this point."""
         return replace(
             config,
             method=self.method,
+            line_motion=self.line_motion,
             prior_sigma=self.prior_sigma,
             max_iterations=self.iterations,
             two_step_max_iterations=self.iterations,
@@ -56,13 +61,17 @@ class Conditions(Checked):
 
 @dataclass(frozen=True)
 class ExactCorners:
-    """The corners of a point's boards without noise, and the truth: ``points`` (x, travel, z) mm, poses and n."""
+    """The corners of a point's boards without noise, and the truth: ``points`` (x, travel, z) mm, poses and n.
+
+    ``edges`` are those of the boards' squares, where the point's calibrations see them.
+    """
 
     points: Float[Tensor, "boards corners 3"]
     board_points: Float[Tensor, "boards corners 3"]
     rotation: Float[Tensor, "boards 3 3"]
     translation: Float[Tensor, "boards 3"]
     n: Float[Tensor, "3"]
+    edges: tuple[BoardEdges, ...] = ()
 
     @property
     def valid(self) -> Bool[Tensor, "boards corners"]:
@@ -100,12 +109,14 @@ def exact_corners(
         pose = simulation.pose
         x, line, z = simulation.trajectory.project(body @ pose.rotation.mT + pose.translation).unbind(-1)
         points.append(torch.stack([x, line * _LINE_PITCH_MM, z], dim=-1))
+    n, with_edges = simulations[0].trajectory.n, conditions.line_motion == "auto"
     return ExactCorners(
         points=torch.stack(points),
         board_points=body.expand(len(poses), *body.shape),
         rotation=torch.stack([simulation.pose.rotation for simulation in simulations]),
         translation=torch.stack([simulation.pose.translation for simulation in simulations]),
-        n=simulations[0].trajectory.n,
+        n=n,
+        edges=tuple(exact_edges(rig, board, item.pose, n) for item in simulations) if with_edges else (),
     )
 
 

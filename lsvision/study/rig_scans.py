@@ -37,19 +37,24 @@ class RigConditions(Checked):
 
 @dataclass(frozen=True)
 class RigScans:
-    """Rigs with their motions, where boards lay before line 0, and what was seen of them: a batch of runs."""
+    """Rigs with their motions, where boards lay before line 0, and what was seen of them: a batch of runs.
+
+    ``state`` is the true rigs and motions in units of what they were drawn from.
+    """
 
     truth: Shared
+    state: Float[Tensor, "runs shared"]
     poses: Pose
     sightings: Sightings
 
 
 def rig_scans(drawn: RigPrior, board: Board, conditions: RigConditions, runs: int) -> RigScans:
     """Draw rigs and motions and scan boards with them; torch's generator of random numbers is used."""
-    truth = drawn.shared(conditions.off * torch.randn(runs, len(drawn.sigma), dtype=torch.float64))
+    state = conditions.off * torch.randn(runs, len(drawn.root), dtype=torch.float64)
+    truth = drawn.shared(state)
     each = Shared(truth.quantities[:, None], truth.n[:, None])
     poses = board_poses(drawn.rig, board, conditions, runs)
-    return RigScans(truth, poses, scanned(drawn.rig, each, poses, board, conditions))
+    return RigScans(truth, state, poses, scanned(drawn.rig, each, poses, board, conditions))
 
 
 def scanned(rig: RawRig, truth: Shared, poses: Pose, board: Board, conditions: RigConditions) -> Sightings:

@@ -1,6 +1,7 @@
 """Two processes share a signal: the smoother against a dense posterior, the likelihood against a naive expectation."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -8,7 +9,9 @@ from torch import Tensor
 
 from lsvision.estimation import Part, SharedModel, SharedSignal, fit_shares, matern, oscillation, smooth_shares
 from lsvision.estimation.gaussian_process import exponential, matern32
+from lsvision.estimation.shared_neighbours import with_neighbours
 from lsvision.estimation.shared_periodograms import Periodograms
+from lsvision.estimation.shared_signal import innovations_of
 
 
 def signal(total: Tensor, difference: Tensor, sigma: float, ratio: float = 1.0) -> SharedSignal:
@@ -96,6 +99,61 @@ def test_what_is_there_is_told_from_what_is_not(seed: int) -> None:
     error = (mean - b)[20:-20]
     assert error.square().mean().sqrt() < 0.1
     assert (error.square() / variance[20:-20]).mean() < 3.0
+
+
+def beats(seed: int, count: int = 260, cycles: tuple[float, float] = (10.0, 10.7)) -> tuple[SharedSignal, Tensor]:
+    """A wave of a and one of b that are less than a cycle apart over the signal, and b."""
+    generator = torch.Generator().manual_seed(seed)
+    n = torch.arange(-1, count, dtype=torch.float64) / count
+    phase = 2 * math.pi * torch.rand(2, generator=generator, dtype=torch.float64)
+    a, b = (size * torch.sin(2 * math.pi * c * n + p) for size, c, p in zip((1.0, 0.5), cycles, phase, strict=True))
+    e, w = torch.randn(2, count, generator=generator, dtype=torch.float64)
+    data = signal(a[1:] + b[1:] + 0.05 * e, a.diff() + 0.1 * w, 0.05)
+    return replace(data, difference_sigma=0.1), b[1:]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_two_waves_within_a_cycle_are_separated_as_well_as_their_sigma_says(seed: int) -> None:
+    data, b = beats(seed)
+    found = fit_shares(data, float(data.total.std()), 9.0)
+    waves = sorted(260 / float(part.span[0]) for part in found.parts if part.kind == "wave")
+    assert waves == pytest.approx([10.0, 10.7], abs=0.15)
+    mean, variance = smooth_shares(found.model, data, block=512, halo=0)
+    error = mean - b
+    assert error.square().mean().sqrt() < 0.1  # 0.25 where both are taken for one wave
+    assert (error.square() / variance).mean() < 3.0
+
+
+@pytest.mark.slow
+def test_neighbours_are_two_sines_that_fit_a_signal_with_gaps() -> None:
+    data, _ = beats(0)
+    data.total_valid[40:60] = False
+    data.difference_valid[100] = False
+    data.total[40:60] = math.nan
+    one = Part("wave", torch.tensor([0.7, 0.4]).double(), torch.tensor([260 / 10.3, 300.0]).double())
+    found = with_neighbours([one], data)
+    assert [260 / float(part.span[0]) for part in found] == pytest.approx([10.0, 10.7], abs=0.15)
+    sizes = torch.stack([part.sigma for part in found]) * math.sqrt(2)
+    torch.testing.assert_close(sizes, torch.tensor([[1.0, 0.0], [0.0, 0.5]]).double(), rtol=0, atol=0.2)
+
+
+def test_a_wave_alone_stays_one() -> None:
+    data, _ = waves(200, 1.0, 0.0)
+    one = Part("wave", torch.tensor([0.7, 0.03]).double(), torch.tensor([40.0, 3000.0]).double())
+    (found,) = with_neighbours([one], data)
+    assert float(found.span[0]) == pytest.approx(40.0, rel=0.01)
+
+
+def test_models_side_by_side_are_as_likely_as_each_alone() -> None:
+    data, _ = waves(40, 1.0, 0.5)
+    models = [
+        SharedModel(*([matern(2, torch.tensor(sigma).double(), torch.tensor(6.0).double())] for _ in range(2)))
+        for sigma in (0.3, 0.7, 1.0)
+    ]
+    together = innovations_of(models, data).log_likelihood
+    alone = torch.cat([innovations_of([model], data).log_likelihood.view(1) for model in models])
+    torch.testing.assert_close(together, alone, rtol=1e-10, atol=1e-8)
 
 
 def test_an_empty_signal_has_nothing() -> None:

@@ -7,7 +7,7 @@ import pytest
 pytestmark = [pytest.mark.slow, pytest.mark.drawn]
 
 
-def _check(summary, *, sheet_px, numbers_rel, lines_mm):
+def _check(summary, *, sheet_px, numbers_rel, lines_mm, product_mm):
     paper, still, vibrating = summary["paper"], summary["still"], summary["vibrating"]
     joint, two_step = still["joint"], still["two_step"]
     floor = [abs(n - true) for n, true in zip(joint["n"], joint["n_true"], strict=True)]
@@ -39,11 +39,28 @@ def _check(summary, *, sheet_px, numbers_rel, lines_mm):
     assert products["sheet_shift_px"]["points"] > 150
     assert products["sheet_shift_px"]["max"] <= sheet_px
     assert products["sheet_rms_mm"]["after"] < 0.1 < 1.0 < products["sheet_rms_mm"]["before"]
+    _check_steadied(vibrating, lines_mm=product_mm)
+
+
+def _check_steadied(vibrating, *, lines_mm):
+    steadied, shaken = vibrating["with_line_motion"], vibrating["products"]["board_distance_rms_mm"]
+    assert steadied["board_distance_rms_mm"].keys() == shaken.keys()
+    for name, board in steadied["board_distance_rms_mm"].items():
+        assert board["corners"] == 88
+        assert board["after"] <= lines_mm < 0.4 < shaken[name]["after"]
+    none, profile, log = (steadied["sheet"][source] for source in ("none", "auto", "log"))
+    assert log["rms_mm"] <= lines_mm
+    assert log["not_seen"] == []
+    # A flat sheet shows depth alone: what lines do sideways stays.
+    assert "dx" in profile["not_seen"]
+    assert profile["by_axis_mm"][2] < 0.1 < 0.5 < none["by_axis_mm"][2]
+    assert profile["by_axis_mm"][0] > 0.4
 
 
 def test_the_paper_at_a_quarter_of_the_pixels(command, tmp_path):
     assert command("+experiment=paper") == 0
-    _check(json.loads((tmp_path / "run" / "summary.json").read_text()), sheet_px=1.0, numbers_rel=0.003, lines_mm=0.03)
+    summary = json.loads((tmp_path / "run" / "summary.json").read_text())
+    _check(summary, sheet_px=1.0, numbers_rel=0.003, lines_mm=0.03, product_mm=0.05)
     assert (tmp_path / "run" / "report.html").stat().st_size > 100_000
     assert not list(tmp_path.rglob("*.partial"))
 
@@ -51,4 +68,5 @@ def test_the_paper_at_a_quarter_of_the_pixels(command, tmp_path):
 def test_the_paper_at_a_tenth_of_the_pixels(command, tmp_path):
     assert command("+experiment=paper", "scale=10", "vibrating.seed=100") == 0
     # Windows of 9 mm around a corner level a part of the shortest wave, of 61 mm, out.
-    _check(json.loads((tmp_path / "run" / "summary.json").read_text()), sheet_px=1.0, numbers_rel=0.08, lines_mm=0.1)
+    summary = json.loads((tmp_path / "run" / "summary.json").read_text())
+    _check(summary, sheet_px=1.0, numbers_rel=0.08, lines_mm=0.1, product_mm=0.05)

@@ -6,9 +6,17 @@ import pytest
 import torch
 
 from lsvision.geometry import ideal_rig
-from lsvision.io import NewScan, read_raw_rig, write_raw_rig, write_scan
+from lsvision.io import (
+    NewScan,
+    read_raw_rig,
+    read_response,
+    read_rig_pair,
+    write_raw_rig,
+    write_response,
+    write_scan,
+)
 from lsvision.stages.rig.sightings import Sightings
-from lsvision.types import RIG_QUANTITIES, RawCamera, RawRig, Travel
+from lsvision.types import RIG_QUANTITIES, CameraResponse, RawCamera, RawRig, Travel
 from tests.stages.rig.boards import DATA_SHEET, Truth, first_of
 
 
@@ -39,6 +47,32 @@ def test_files_hold_the_same_rig_with_its_covariance(command, scans, tmp_path, c
     assert dict(rig.sigma)["baseline_mm"] ** 2 == pytest.approx(float(covariance[10, 10]))
     assert data["verdict"] in capsys.readouterr().out
     assert (tmp_path / "run" / "report.html").stat().st_size > 1000
+
+
+def test_the_responses_of_the_cameras_are_kept(command, scans, tmp_path):
+    """Those of the data sheet, copied beside the new rig file under the names that it has."""
+    gain = torch.linspace(0.5, 1.0, 7142)[:, None]
+    write_response(CameraResponse(torch.zeros(7142, 1), gain), tmp_path / "of_left.tif")
+    write_raw_rig(DATA_SHEET, tmp_path / "sheet.yaml", {"left": "of_left.tif"})
+    assert command("+experiment=rig", f"scans=[{','.join(scans)}]", f"data_sheet={tmp_path / 'sheet.yaml'}") == 0
+    assert read_rig_pair(tmp_path / "run" / "rig.yaml").response == {"left": "left_response.tif"}
+    assert torch.equal(read_response(tmp_path / "run" / "left_response.tif").gain, gain)
+
+
+def test_the_responses_of_the_scans_are_kept(command, scans, tmp_path):
+    even = CameraResponse(torch.ones(64, 1), torch.ones(64, 1))
+    write_response(even, tmp_path / "a" / "r.tif")
+    write_raw_rig(read_raw_rig(tmp_path / "a" / "rig.yaml"), tmp_path / "a" / "rig.yaml", {"right": "r.tif"})
+    assert command("+experiment=rig", f"scans=[{','.join(scans)}]", f"data_sheet={tmp_path / 'sheet.yaml'}") == 0
+    assert read_rig_pair(tmp_path / "run" / "rig.yaml").response == {"right": "right_response.tif"}
+    assert torch.equal(read_response(tmp_path / "run" / "right_response.tif").offset, even.offset)
+
+
+def test_a_response_that_is_not_there_is_one_line(command, scans, tmp_path, capsys):
+    write_raw_rig(DATA_SHEET, tmp_path / "sheet.yaml", {"left": "lost.tif"})
+    assert command("+experiment=rig", f"scans=[{scans[0]}]", f"data_sheet={tmp_path / 'sheet.yaml'}") == 1
+    error = capsys.readouterr().err
+    assert error.startswith(f"error: {tmp_path / 'sheet.yaml'}: response.left: no such file or folder")
 
 
 @pytest.mark.slow

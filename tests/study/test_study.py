@@ -13,7 +13,7 @@ from hydra import compose, initialize_config_dir
 from lsvision.errors import ConfigError
 from lsvision.estimation import fisher_information, marginal_information
 from lsvision.experiments.command import config_folder
-from lsvision.geometry import displace, transform
+from lsvision.geometry import displace, scan_position, transform
 from lsvision.simulation import BoardPose
 from lsvision.stages.calibration.calibrate import calibrate_batch
 from lsvision.stages.calibration.config import CalibrationConfig
@@ -27,7 +27,7 @@ from lsvision.study.points import (
     true_information,
     true_problem,
 )
-from lsvision.study.runs import Sampling, noisy_points, run_points
+from lsvision.study.runs import Sampling, noisy_edges, noisy_points, run_points
 from lsvision.study.tables import iterations_table, points_table, runs_table
 from lsvision.types import Board
 
@@ -163,6 +163,54 @@ def test_unknown_vibration_shows_in_error_and_is_covered(rig):
     assert 1.0 < shaken["nees"] < 4.5
 
 
+def test_edges_lie_on_the_board_and_are_disturbed_as_its_corners_are(rig):
+    shaken = dataclasses.replace(POINT, line_motion="auto", corner_sigma_mm=1e-9, depth_sigma_mm=1e-9, vibration_mm=0.3)
+    corners = exact_corners(rig, BOARD, PLACINGS, shaken)
+    assert not exact_corners(rig, BOARD, PLACINGS, POINT).edges
+    for board, (edges, seen) in enumerate(zip(corners.edges, noisy_edges(corners, shaken, 0, 3), strict=True)):
+        pose = corners.rotation[board], corners.translation[board]
+        start, stop = (scan_position(transform(*pose, ends), corners.n) for ends in (edges.start, edges.stop))
+        share = (edges.points[:, 1] - start[:, 1]) / (stop - start)[:, 1]
+        torch.testing.assert_close(edges.points, torch.lerp(start, stop, share[:, None]), rtol=0, atol=1e-9)
+        assert (share.min() > 0.2, share.max() < 0.8) == (True, True)
+        # Interpolated between the lines of the corners: what vibrates is their travel, whatever shows it.
+        moved, by_corner = seen.points - edges.points, noisy_points(corners, shaken, 0, 3, 4)[0, board]
+        angle = 2 * math.pi / shaken.vibration_wavelength_mm
+        for index in (0, 2):
+            at_corners = (by_corner - corners.points[board])[:, index]
+            waves = [
+                torch.stack([f(angle * y) for f in (torch.cos, torch.sin)], -1)
+                for y in (corners.points[board, :, 1], edges.points[:, 1])
+            ]
+            fit = torch.linalg.lstsq(waves[0], at_corners[:, None]).solution
+            torch.testing.assert_close(moved[:, index], (waves[1] @ fit)[:, 0], rtol=0, atol=1e-6)
+
+
+def test_noise_of_edges_is_as_large_as_that_of_corners(rig):
+    noisy = dataclasses.replace(POINT, line_motion="auto", corner_sigma_mm=0.1, depth_sigma_mm=0.02)
+    corners = exact_corners(rig, BOARD, PLACINGS, noisy)
+    exact = corners.edges[0]
+    error = torch.cat([noisy_edges(corners, noisy, 0, run)[0].points - exact.points for run in range(20)])
+    # An error of the disparity moves a crossing along its ray.
+    slope = (exact.by_column[:, 0, 1] / exact.by_column[:, 1, 1]).repeat(20)
+    sideways = (error[:, 0] - slope * error[:, 2]).std()
+    assert float(sideways) == pytest.approx(0.1, rel=0.03)
+    assert float(error[:, 2].std()) == pytest.approx(0.02, rel=0.03)
+    assert not error[:, 1].any()
+
+
+@pytest.mark.slow
+def test_motion_from_line_to_line_leaves_the_noise_of_the_corners(rig):
+    """And the same of every run, whatever the batch."""
+    shaken = dataclasses.replace(POINT, boards="two", vibration_mm=0.3, vibration_wavelength_mm=97.0)
+    points = [dataclasses.replace(shaken, line_motion=motion) for motion in ("none", "auto")]
+    runs, table, _ = table_of(rig, points, runs=3)
+    without, measured = table["rmse_after_mm"].to_list()
+    assert measured < 0.06 < 0.2 < without
+    assert measured > 0.02
+    assert runs.equals(table_of(rig, points, runs=3, batch=2, threads=2)[0])
+
+
 def test_map_is_blind_at_its_centre_and_sharpens_outwards(rig):
     tilts = tilt_map(rig, BOARD, POINT, 10.0, 5)
     assert tilts.tilts_deg.tolist() == [-10.0, -5.0, 0.0, 5.0, 10.0]
@@ -233,7 +281,9 @@ def test_a_wrong_option_is_one_line(override, command, capsys):
     assert line.startswith("error: " + override.split("=")[0])
 
 
-@pytest.mark.parametrize("name", ["study_paper", "study_tilts", "study_noise", "study_vibration", "study_convergence"])
+@pytest.mark.parametrize(
+    "name", ["study_paper", "study_tilts", "study_noise", "study_vibration", "study_line_motion", "study_convergence"]
+)
 def test_shipped_studies_have_points(name):
     with initialize_config_dir(str(config_folder()), version_base="1.3"):
         config = compose("config", [f"+experiment={name}"])

@@ -146,9 +146,10 @@ def read_raw_rig(path: Path | str) -> RawRig:
     return raw_rig_from_dict(read_yaml(path), path)
 
 
-def write_raw_rig(rig: RawRig, path: Path | str) -> None:
-    """Write ``rig.yaml`` of a raw pair."""
-    write_text(path, yaml.safe_dump(raw_rig_to_dict(rig), sort_keys=False, default_flow_style=None))
+def write_raw_rig(rig: RawRig, path: Path | str, response: Mapping[str, str] | None = None) -> None:
+    """Write ``rig.yaml`` of a raw pair, with the files of the cameras' responses by camera, relative to it."""
+    entries = raw_rig_to_dict(rig) | ({"response": dict(response)} if response else {})
+    write_text(path, yaml.safe_dump(entries, sort_keys=False, default_flow_style=None))
 
 
 def raw_rig_to_dict(rig: RawRig) -> dict[str, object]:

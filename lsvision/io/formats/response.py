@@ -10,6 +10,7 @@ from torch import Tensor
 from lsvision.errors import FileFormatError
 from lsvision.image.flat_field import FlatFieldImage
 from lsvision.io.atomic import write_text
+from lsvision.io.formats.raw_rig import read_rig_pair
 from lsvision.io.formats.validation import named_file, read_yaml
 from lsvision.io.images.line_image import open_line_image
 from lsvision.io.images.tiff import write_line_image
@@ -65,6 +66,19 @@ def write_rig_with_response(rig: Path, target: Path, files: Mapping[str, str]) -
         raise FileFormatError(rig, "expected keys with values")
     entries = {**data, "response": dict(files)}
     write_text(target, yaml.safe_dump(entries, sort_keys=False, default_flow_style=None))
+
+
+def copy_response(rig: Path, folder: Path) -> dict[str, str]:
+    """Copy the cameras' responses that a rig file names into a folder; their names there by camera, none of even ones.
+
+    Raises:
+        FileFormatError: the rig file or a response cannot be read.
+    """
+    copied = {}
+    for camera, name in read_rig_pair(rig).response.items():
+        copied[camera] = f"{camera}_response.tif"
+        write_response(read_response(named_file(rig, f"response.{camera}", name)), folder / copied[camera])
+    return copied
 
 
 def made_even(rig: Path, response: Mapping[str, str], images: Mapping[str, LineImage]) -> dict[str, LineImage]:

@@ -1,6 +1,6 @@
 """The result of calibrating a batch of problems."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -39,6 +39,13 @@ class BatchCalibration:
     iterations: Int[Tensor, "*batch"]
     converged: Bool[Tensor, "*batch"]
     info: Int[Tensor, "*batch"]
+
+    def as_batch_of_one(self) -> "BatchCalibration":
+        """One problem's calibration with a leading batch dimension of one."""
+        by_iteration = ("rmse_path_mm", "n_path")
+        return BatchCalibration(
+            **{item.name: getattr(self, item.name).unsqueeze(int(item.name in by_iteration)) for item in fields(self)}
+        )
 
 
 def iterations_of(batch: BatchCalibration) -> tuple[Iteration, ...]:

@@ -28,7 +28,7 @@ from lsvision.stages.calibration.verdict import UNLIKE, judge, not_settled, rmse
 from lsvision.stages.calibration.with_edges import with_edges
 from lsvision.types import BoardCorners, BoardEdges, BoardFit, Calibration, LineMotion, Motion, Pose, Rig
 
-__all__ = ["BatchCalibration", "CalibrationConfig", "calibrate", "calibrate_batch"]
+__all__ = ["BatchCalibration", "CalibrationConfig", "calibrate", "calibrate_batch", "calibrate_edges"]
 
 
 def calibrate(
@@ -154,6 +154,19 @@ def calibrate_batch(
         ConfigError: a mounting pitch is given for more than one board.
     """
     return solve(BoardMeasurements(points, covariance, board_points, valid), config).summary()
+
+
+def calibrate_edges(
+    measured: BoardMeasurements, edges: Sequence[BoardEdges | None], config: CalibrationConfig
+) -> BatchCalibration:
+    """Calibrate one problem, with the edges of its boards where its corners show that they shook.
+
+    Raises:
+        ConfigError: a mounting pitch is given for more than one board.
+    """
+    solution = solve(measured, config)
+    shaken = bool(solution.along_scan.found) and config.corrects_lines
+    return (with_edges(solution, edges) if shaken else solution).summary()
 
 
 def _what_edges_did(before: Solution, after: Solution) -> tuple[str, ...]:

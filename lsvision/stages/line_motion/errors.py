@@ -7,9 +7,10 @@ R = s_u s_u' κ(u - u') is the covariance of ψ at the true displacement, and wi
 
     displacements = G ψ,   G = (aᵀ d a)⁻¹ aᵀ,    cov = G R Gᵀ,    cov of the residuals = (1 - d a G) R (1 - d a G)ᵀ.
 
-The last equation says how much the fit took; κ and s are raised until the residuals are as expected. How long errors
-last shows in sums over pieces of neighbouring columns, as those carry what moves a line. What a matching error has in
-common all over a line does not show in residuals and is stated beforehand.
+The last equation says how much the fit took; κ and s are raised until the residuals are as expected. Errors reach over
+more columns of a flat crown than of a flank: each displacement has the κ of the columns that show it, weighted by G.
+How long errors last shows in sums over pieces of neighbouring columns, as those carry what moves a line. What a
+matching error has in common all over a line does not show in residuals and is stated beforehand.
 
 Source: Huber 1981, ch. 7 (M-estimates); Newey & West 1987 (correlated errors); Bell & McCaffrey 2002 (residuals).
 """
@@ -103,21 +104,31 @@ class LineErrors:
         stated = torch.linalg.inv(a.T @ (weight * a) + loose)
         known = torch.linalg.inv(a.T @ (slope * a) + loose)
         G = known @ a.T
-        R = _covariance(sums.products[there][:, there], sums.pairs[there][:, there], slope * a @ G)
-        covariance = G @ R @ G.T + known @ loose @ known
-        variance = covariance.diagonal().maximum(_LEAST_SCALE**2 * stated.diagonal())
+        products, pairs, taken = sums.products[there][:, there], sums.pairs[there][:, there], slope * a @ G
+        R = torch.stack([_covariance(products, pairs, taken, row.abs()) for row in G])
+        found = (G[:, None] @ R @ G[..., None])[:, 0, 0] + (known @ loose @ known).diagonal()
+        variance = found.maximum(_LEAST_SCALE**2 * stated.diagonal())
         variance = variance + variance.new_tensor([0.0, common_mm**2, 0.0])
         share = torch.zeros_like(sums.sensitivity)
-        share[there] = (G.square() * R.diagonal()).T
+        share[there] = (G.square() * R.diagonal(dim1=-2, dim2=-1)).T
         return cls((variance / stated.diagonal()).sqrt(), _memory(sums, _in_pieces(share.T).T), variance.sqrt())
 
 
-def _covariance(products: Tensor, pairs: Tensor, taken: Tensor) -> Float[Tensor, "columns columns"]:
-    """R from what the fit left, (1 - ``taken``) R (1 - ``taken``)ᵀ: ``products`` over ``pairs``."""
-    s = (products.diagonal() / pairs.diagonal()).sqrt().clamp(min=torch.finfo(products.dtype).tiny)
+def _covariance(
+    products: Tensor, pairs: Tensor, taken: Tensor, part: Float[Tensor, " columns"]
+) -> Float[Tensor, "columns columns"]:
+    """R from what the fit left, (1 - ``taken``) R (1 - ``taken``)ᵀ: ``products`` over ``pairs``.
+
+    Args:
+        part: of each column in what R is asked for, >= 0: the correlations are those of the columns that matter.
+    """
+    tiny = torch.finfo(products.dtype).tiny
+    s = (products.diagonal() / pairs.diagonal()).sqrt().clamp(min=tiny)
+    matter = part * part[:, None] / part.square().max().clamp(min=tiny)
+    products, pairs = matter * products, matter * pairs
     weight = pairs * s * s[:, None]
     left = torch.eye(len(s)).to(s) - taken
-    found = _by_lag(products) / _by_lag(weight).clamp(min=torch.finfo(s.dtype).tiny)
+    found = _by_lag(products) / _by_lag(weight).clamp(min=tiny)
     kappa = found
     lag = (torch.arange(len(s))[:, None] - torch.arange(len(s))).abs()
     for _ in range(_ROUNDS):

@@ -61,7 +61,7 @@ def next_scan(solution: RigSolution, shape: HeightShape, depth_range_mm: float) 
     poses = _candidates(solution, depth_range_mm)
     precision = torch.linalg.inv(solution.whitened_covariance) + _information(solution, poses) / solution.noise_scale**2
     factor = torch.linalg.cholesky(torch.linalg.inv(precision))
-    bends = shape.stated_mm(factor)
+    bends = shape.stated_mm(solution.model.prior.in_sigmas(factor))
     best = int(bends.argmin())
     turned, about_x, about_y, sideways, deeper = poses[best].tolist()
     return Proposal(bool(turned), about_x, about_y, sideways, deeper, 1e3 * float(bends[best]))

@@ -57,7 +57,7 @@ def calibrate_rig(sightings: Sightings, scans: Sequence[str], rig: RawRig, confi
     shared = solution.shared
     depth_range_mm = config.depth_range_mm or sharp_depth_mm(ideal_rig(rig))
     shape = HeightShape.of(rig, shared, prior.sigma, depth_range_mm)
-    weak = unobserved(solution.whitened_covariance, shape, config.observed_share)
+    weak = unobserved(solution, shape, config)
     advice = next_scan(solution, shape, depth_range_mm).in_words
     reasons = [*_faults(solution), *contradicting]
     bending = [combination for combination in weak if combination.bend_um >= config.least_height_um]
@@ -72,7 +72,7 @@ def calibrate_rig(sightings: Sightings, scans: Sequence[str], rig: RawRig, confi
         boards=_boards(solution, scans, held_out),
         residuals=_residuals(solution),
         noise_scale=float(solution.noise_scale),
-        height_error_um=1e3 * float(shape.stated_mm(solution.found.factor)),
+        height_error_um=1e3 * float(shape.stated_mm(solution.factor)),
         unobserved=weak,
         advice=advice,
         verdict=_verdict(solution, bool(bending)),

@@ -45,14 +45,19 @@ class RigSolution:
 
     @property
     def whitened_covariance(self) -> Float[Tensor, "*batch shared shared"]:
-        """Covariance of rig and motion in units of the prior's sigmas."""
+        """Covariance of the state: of rig and motion in units of the prior."""
         return self.found.factor @ self.found.factor.mT
 
     @property
     def covariance(self) -> Float[Tensor, "*batch shared shared"]:
         """Covariance of rig and motion, in their units."""
-        sigma = self.model.prior.sigma
-        return sigma[:, None] * self.whitened_covariance * sigma
+        factor = self.model.prior.root @ self.found.factor
+        return factor @ factor.mT
+
+    @property
+    def factor(self) -> Float[Tensor, "*batch shared columns"]:
+        """Factor of the covariance of rig and motion, in the prior's sigmas."""
+        return self.model.prior.in_sigmas(self.found.factor)
 
     @property
     def whitened(self) -> Float[Tensor, "*batch boards corners 4"]:
@@ -78,10 +83,16 @@ def corner_residuals(
     """Corners measured less predicted in sigmas: column and travel in the left and in the right image."""
     predicted = model.predict(state)
     rows = [
-        torch.linalg.solve_triangular(eye.factor, (eye.position - there)[..., None], upper=False)[..., 0]
+        _in_sigmas(eye.factor, eye.position - there)
         for eye, there in ((sightings.left, predicted.left), (sightings.right, predicted.right))
     ]
     return torch.where(sightings.valid[..., None], torch.cat(rows, dim=-1), 0.0)
+
+
+def _in_sigmas(factor: Float[Tensor, "*#batch 2 2"], off: Float[Tensor, "*#batch 2"]) -> Float[Tensor, "*batch 2"]:
+    """Solution of factor x = off, lower triangular, written out: LAPACK is called once for every corner."""
+    first = off[..., 0] / factor[..., 0, 0]
+    return torch.stack([first, (off[..., 1] - factor[..., 1, 0] * first) / factor[..., 1, 1]], dim=-1)
 
 
 def whitened_along(

@@ -168,3 +168,15 @@ def test_scans_without_edges_are_solved_by_their_corners():
     assert torch.equal(plain.motion.n, without.motion.n)
     for ours, theirs in zip(plain.line_motions, without.line_motions, strict=True):
         assert torch.equal(ours.values, theirs.values)
+
+
+def test_the_right_camera_sees_a_motion_when_it_looks():
+    """A crossing whose partner is seen two millimetres later: two moments of the vibration, one of the edge."""
+    corners, motion = shaken_boards(0, TWO_TILTS)
+    problem, state = at_truth(corners)
+    edges = edges_of(corners, motion, later_mm=2.0)
+    known = edge_rows(problem, state, edges).sigma_px
+    expected = torch.tensor([COLUMN_SIGMA, DISPARITY_SIGMA], dtype=torch.float64).expand(2, -1)
+    torch.testing.assert_close(known, expected, rtol=0.1, atol=0)
+    at_once = edge_rows(problem, state, [dataclasses.replace(found, later_mm=None) for found in edges]).sigma_px
+    assert float((at_once / known)[:, 0].min()) > 1.3

@@ -43,15 +43,20 @@ def rig(spacing: float = 4.0):
 
 
 def rail(
-    lines: int, vibration_mm: float, wave_mm: float, seed: int = 0, spacing: float = 4.0, registered: bool = True
+    lines: int,
+    vibration_mm: float,
+    wave_mm: float,
+    seed: int = 0,
+    registered: bool = True,
+    lengths_mm: tuple[float, float] = (VIBRATION_MM, CORRUGATION_MM),
 ) -> tuple[Simulation, Scan]:
-    """A rail with amplitudes of vibration in depth and of corrugation."""
-    scene = SceneConfig("rail", corrugation_mm=wave_mm, corrugation_wavelength_mm=CORRUGATION_MM, seed=seed)
+    """A rail with amplitudes of vibration in depth and of corrugation, and their wavelengths."""
+    scene = SceneConfig("rail", corrugation_mm=wave_mm, corrugation_wavelength_mm=lengths_mm[1], seed=seed)
     motion = dataclasses.replace(
-        AT_REST, vibration_z_mm=vibration_mm / math.sqrt(2), vibration_wavelengths_mm=(VIBRATION_MM,), seed=seed
+        AT_REST, vibration_z_mm=vibration_mm / math.sqrt(2), vibration_wavelengths_mm=lengths_mm[:1], seed=seed
     )
     sensor = SensorConfig(supersampling=2, seed=seed, color_registered=registered)
-    source = simulate(rig(spacing), BOARD, scene, motion, sensor, Acquisition(PITCH, lines=lines))
+    source = simulate(rig(), BOARD, scene, motion, sensor, Acquisition(PITCH, lines=lines))
     left, right = (TensorImage(torch.cat(list(source.strips(camera)))) for camera in ("left", "right"))
     return source, Scan(Path("rail"), source.rig, source.travel, StereoPair(left, right), registered)
 
@@ -82,10 +87,10 @@ def measured(source: Simulation, scan: Scan, config: LineMotionConfig = CONFIG) 
 
 def amplitudes(source: Simulation, values: Tensor) -> Tensor:
     """Of the waves of the vibration and of the corrugation, mm."""
-    along = torch.arange(len(values)).double() * PITCH
+    along, motion = torch.arange(len(values)).double() * PITCH, source.trajectory.motion
     angles = [
-        2 * math.pi * along / VIBRATION_MM,
-        2 * math.pi * along * source.trajectory.motion.stretch / CORRUGATION_MM,
+        2 * math.pi * along / motion.vibration_wavelengths_mm[0],
+        2 * math.pi * along * motion.stretch / source.scene.corrugation_wavelength_mm,
     ]
     parts = [f(angle) for angle in angles for f in (torch.cos, torch.sin)]
     found = torch.linalg.lstsq(torch.stack([*parts, torch.ones_like(along), along], 1), values[:, None]).solution
@@ -156,6 +161,23 @@ def test_corrugation_stays_in_the_height_under_vibration(seed: int) -> None:
     assert finding.shape_rms == pytest.approx(0.05 / math.sqrt(2), abs=0.006)
     assert finding.separated_up_to_mm > 100.0
     assert "are the object's shape" in finding.in_words
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [0, 1])
+def test_waves_less_than_a_cycle_apart_are_separated_or_stated_as_unknown(seed: int) -> None:
+    """80 and 75 mm over 800 mm: their sigma covers what is not told apart."""
+    source, scan = rail(2860, 0.1, 0.05, seed, lengths_mm=(80.0, 75.0))
+    found = measured(source, scan)
+    error = found.dz_mm - true_depth(source)
+    vibration, _ = amplitudes(source, found.dz_mm)
+    _, kept = amplitudes(source, true_corrugation(source) + error)
+    # 2 sigma of an amplitude whose errors are correlated all along: sqrt(2) times that of its values.
+    known = 2 * math.sqrt(2) * float(found.sigma[:, 1].square().mean().sqrt())
+    assert vibration == pytest.approx(0.1, abs=max(0.01, known))
+    assert kept == pytest.approx(0.05, abs=max(0.01, known))
+    assert known < 0.03
+    assert (error / found.sigma[:, 1]).square().mean() < 4.0  # of one error, as it is one wave
 
 
 @pytest.mark.slow

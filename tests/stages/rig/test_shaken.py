@@ -65,7 +65,7 @@ def errors(runs: int, boards: int = 8, size=(0.5, 0.5, 0.02)) -> list[dict[str, 
             off = solution.shared.vector - truth.vector[0]
             row |= {
                 f"{name}_um": 1e3 * float(shape.bend_mm(off / PRIOR.sigma)),
-                f"{name}_stated_um": 1e3 * float(shape.stated_mm(solution.found.factor)),
+                f"{name}_stated_um": 1e3 * float(shape.stated_mm(solution.factor)),
                 f"{name}_nees": float(off @ torch.linalg.solve(solution.covariance, off)),
                 f"{name}_noise": float(solution.noise_scale),
                 f"{name}_n1": abs(float(off[QUANTITIES])),
