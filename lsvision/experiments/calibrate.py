@@ -70,8 +70,9 @@ def run_calibrate(settings: CalibrateSettings, folder: Path) -> None:
     calibration = calibrate_with_edges(scans, boards, settings.board, settings.calibration)
     if Rectification.of(scans[0].raw_rig) is not None:
         # The cameras look at planes of their own: the n by which the object moves from one to the other is known now.
-        boards = measure_boards(scans, located, settings, calibration.motion.n)
-        calibration = calibrate_with_edges(scans, boards, settings.board, settings.calibration)
+        n = calibration.motion.n
+        boards = measure_boards(scans, located, settings, n)
+        calibration = calibrate_with_edges(scans, boards, settings.board, settings.calibration, n)
     provenance = Provenance(
         version=__version__,
         config_sha256=settings_sha256(settings),
@@ -101,25 +102,34 @@ def alignment(
 
 
 def calibrate_with_edges(
-    scans: Sequence[Scan], boards: Sequence[BoardCorners], board: Board, config: CalibrationConfig
+    scans: Sequence[Scan],
+    boards: Sequence[BoardCorners],
+    board: Board,
+    config: CalibrationConfig,
+    n: Tensor | None = None,
 ) -> Calibration:
     """Calibrate from the corners; where they show that the boards shook, from the edges on every line as well.
 
     On one thread: the matrices are small, and threads that wait for each other cost more than they save.
+
+    Args:
+        n: motion of the object between the planes of a raw rig's cameras; nominal if None.
     """
     with one_torch_thread():
         calibration = calibrate(boards, scans[0].rig, config)
         if not calibration.errors_along_scan or not config.corrects_lines:
             return calibration
-        return calibrate(boards, scans[0].rig, config, _edges_of(scans, boards, board))
+        return calibrate(boards, scans[0].rig, config, _edges_of(scans, boards, board, n))
 
 
-def _edges_of(scans: Sequence[Scan], boards: Sequence[BoardCorners], board: Board) -> list[BoardEdges | None]:
+def _edges_of(
+    scans: Sequence[Scan], boards: Sequence[BoardCorners], board: Board, n: Tensor | None
+) -> list[BoardEdges | None]:
     with progress_bars() as bars:
         bar = bars.start("find edges", total=len(scans))
         edges: list[BoardEdges | None] = []
         for scan, corners in zip(scans, boards, strict=True):
-            edges.append(find_edges(scan, board, corners))
+            edges.append(find_edges(scan, board, corners, n))
             bars.advance(bar)
     return edges
 

@@ -145,8 +145,8 @@ class Rectification:
 class MatchedColumns:
     """Depth from disparities of matched images, for columns of the ideal left image.
 
-    Of the slope of the right ray, ``slope(U) - convergence`` in the column U of the raw left image that its partner is
-    found at, ``terms`` are Taylor's at U = ``places``, in powers of the disparity: the fourth would be 4e-4 px.
+    The inverse depth of a pair is nearly linear in the disparity. ``terms`` are Taylor's at no disparity, in powers of
+    it: the fourth would be 4e-4 px.
 
     Attributes:
         places: columns of the raw left image, px.
@@ -156,40 +156,39 @@ class MatchedColumns:
     rectification: Rectification
     places: Float[Tensor, " width"]
     growth: Float[Tensor, " width"]
-    of_left: Float[Tensor, " width"]
     terms: Float[Tensor, "4 width"]
 
     @classmethod
     def of(cls, rectification: Rectification) -> "MatchedColumns":
         """All columns of the ideal left image."""
         columns = torch.arange(rectification.rig.width_px, dtype=torch.float64)
-        places = rectification.raw_left_columns
+        places, of_left = rectification.raw_left_columns, slope_at(rectification.rig, columns)
         step = torch.tensor(_TAYLOR_STEP, dtype=torch.float64)
-        least, less, more, most = (rectification.raw.left.slope(places + at * step) for at in (-2, -1, 1, 2))
-        middle = rectification.raw.left.slope(places)
+
+        def inverse_depth(disparity: Tensor) -> Tensor:
+            of_right = rectification.raw.left.slope(places - disparity) - rectification.convergence
+            return 1.0 / rectification.raw.meet_rays(of_left, of_right, rectification.n).z
+
+        least, less, middle, more, most = (inverse_depth(at * step) for at in (-2, -1, 0, 1, 2))
         terms = [
-            middle - rectification.convergence,
-            (8 * (less - more) + most - least) / (12 * step),  # the partner of disparity d lies at U - d
+            middle,
+            (8 * (more - less) + least - most) / (12 * step),
             (less - 2 * middle + more) / (2 * step**2),
-            (2 * more - 2 * less + least - most) / (12 * step**3),
+            (2 * less - 2 * more + most - least) / (12 * step**3),
         ]
-        growth = rectification.growth(places, "left")
-        return cls(rectification, places, growth, slope_at(rectification.rig, columns), torch.stack(terms))
+        return cls(rectification, places, rectification.growth(places, "left"), torch.stack(terms))
 
     def part(self, columns: slice, like: Tensor) -> "MatchedColumns":
         """Some of the columns, with the dtype of another tensor; the places stay as they are."""
-        growth, of_left, terms = (values[..., columns].to(like) for values in (self.growth, self.of_left, self.terms))
-        return MatchedColumns(self.rectification, self.places[columns], growth, of_left, terms)
+        growth, terms = (values[..., columns].to(like) for values in (self.growth, self.terms))
+        return MatchedColumns(self.rectification, self.places[columns], growth, terms)
 
     def depth(self, disparity_px: Float[Tensor, "rows width"]) -> Float[Tensor, "rows width"]:
         """Depth z, mm; NaN where the rays do not meet in front of the cameras."""
-        of_right = self.terms[3] * disparity_px
-        for term in (self.terms[2], self.terms[1]):
-            of_right.add_(term).mul_(disparity_px)
-        of_right.add_(self.terms[0])
-        of = self.rectification
-        z = of.raw.meet_rays(self.of_left, of_right, of.n.to(disparity_px)).z
-        return torch.where(z > 0, z, torch.nan)
+        inverse = torch.addcmul(self.terms[2], self.terms[3], disparity_px)
+        for term in (self.terms[1], self.terms[0]):
+            inverse.mul_(disparity_px).add_(term)
+        return inverse.masked_fill_(inverse <= 0, torch.nan).reciprocal_()
 
     def depth_sigma(
         self, z: Float[Tensor, "rows width"], disparity_sigma_px: Float[Tensor, "rows width"]

@@ -50,6 +50,15 @@ class ShearedRows:
         at = lines[:, None]
         return (at if self.late_mm is None else self._later(at, -1.0, columns)) - self.first
 
+    def rows_after(self, row: int, lines: range, columns: Int[Tensor, " columns"]) -> Float[Tensor, "lines columns"]:
+        """The rows on which some lines lie in columns, counted from one near them; float32 is exact."""
+        if self.late_mm is None or self._late_lines is not None:
+            at = torch.arange(lines.start - row - self.first, lines.stop - row - self.first, dtype=torch.float32)[
+                :, None
+            ]
+            return at if self._late_lines is None else at - self._late_lines[columns].float()
+        return (self.rows_of(torch.arange(lines.start, lines.stop, dtype=torch.float64), columns) - row).float()
+
     def reach(self, lines: tuple[int, int]) -> tuple[int, int]:
         """First row, and one past the last, that lines ``lines[0]..lines[1]-1`` lie on or between."""
         rows = self.rows_of(torch.tensor([lines[0], lines[1] - 1], dtype=torch.float64))
@@ -130,6 +139,10 @@ class ResampledImage:
         for channel in range(values.shape[2]):  # OpenCV counts places in 32nds of a pixel where there are several
             plane = values[..., channel]
             plane = plane.contiguous() if self._taps is None else self._taps.of(plane)
+            if self.rows.late_mm is None:  # rows are lines
+                taken = torch.arange(rows.start, rows.stop) + (self.rows.first - first_line)
+                out[..., channel] = _in_range(plane[taken.clamp_(0, len(plane) - 1)], out.dtype)
+                continue
             for tile in self._tiles(rows, first_line, along_lines=False):
                 found = cv2.remap(
                     plane.numpy(), tile.column, tile.line, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
@@ -229,19 +242,3 @@ class _Positions:
         ends = (self.line.min(), self.line.max()), (self.column[0, 0], self.column[0, -1])
         lines, columns = (slice(max(int(low) - 1, 0), max(int(high) + 3, 1)) for low, high in ends)
         return lines, columns
-
-
-@dataclass(frozen=True)
-class ColumnMap:
-    """Where the columns of a resampled image lie in its source: ``places[u]``, px, and between them on a line.
-
-    The map of a lens bends by less than 1e-4 px from one column to the next.
-    """
-
-    places: Float[Tensor, " width"]
-
-    def __call__(self, column: Float[Tensor, "*cells"]) -> Float[Tensor, "*cells"]:
-        """Columns of the source, px, in the dtype of ``column``; those beyond the ends go on evenly."""
-        base = column.nan_to_num().long().clamp_(0, len(self.places) - 2)  # towards zero: the first one below it
-        places, steps = (values.to(column) for values in (self.places, self.places.diff()))
-        return places[base].addcmul_(column - base, steps[base])

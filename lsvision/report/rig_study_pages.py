@@ -13,6 +13,7 @@ _MERITS = {
     "stated_um": "as stated [um]",
     "over_bound": "over the Cramér-Rao bound",
     "nees": "NEES",
+    "within_3_sigma": "errors within 3 sigma",
     "largest_z": "largest error [sigma]",
     "converged": "converged",
 }
@@ -24,7 +25,7 @@ def rig_study_report(title: str, points: polars.DataFrame, axes: Sequence[str], 
     Args:
         points: as ``run_rigs`` gives them. axes: names of the varied conditions.
     """
-    unknowns, runs = points["unknowns"][0], points["runs"][0]
+    unknowns, band, runs = points["unknowns"][0], points["nees_band"][0], points["runs"][0]
     heights, nees, converged = (points[name].to_numpy() for name in ("height_error_um", "nees", "converged"))
     page = Page(
         title=title,
@@ -34,7 +35,9 @@ def rig_study_report(title: str, points: polars.DataFrame, axes: Sequence[str], 
         ),
         headlines=[
             Headline("Heights", f"{heights.min():.2g} to {heights.max():.2g} um", "rms error over the points"),
-            Headline("NEES", f"{nees.mean():.1f}", f"mean over the points; {unknowns:.0f} is right"),
+            Headline(
+                "NEES", f"{nees.mean():.1f}", f"mean over the points; of each {unknowns:.0f} ± {band:.1f} is right"
+            ),
             Headline("Converged", f"{100 * converged.mean():.0f} %", "of all calibrations"),
         ],
         tables=[_table(points, axes)],
@@ -64,6 +67,6 @@ def _heights(points: polars.DataFrame, axes: Sequence[str]) -> ReportFigure:
     figure.legend(loc="outside right upper", fontsize=9)
     caption = (
         "One mark is one point; where error and statement agree, a calibration says how good it is. "
-        "No calibration of the same scans is below the bound."
+        "On average over the rigs no calibration of the same scans is below the bound."
     )
     return ReportFigure("heights", "Heights", caption, figure)

@@ -6,6 +6,7 @@ from dataclasses import asdict, dataclass
 
 import polars
 import torch
+from torch import Tensor
 
 from lsvision.geometry import ideal_rig, sharp_depth_mm
 from lsvision.report.progress import progress_bars
@@ -42,8 +43,8 @@ def run_rigs(
         prior: of the calibrations. drawn: distribution that the true rigs and motions are drawn from.
 
     ``height_error_um`` is the rms bend of heights over the runs, ``stated_um`` that which the calibrations state,
-    ``bound_um`` the least that any estimate of rigs so drawn can have, and ``over_bound`` the first over the last: 1
-    where a calibration is as good as can be, which it can be where prior and drawn are the same;
+    ``bound_um`` the least that any estimate of rigs so drawn can have (``rig_bound``), and ``over_bound`` the first
+    over the last: 1 where a calibration is as good as can be, which it can be where prior and drawn are the same;
     ``nees`` is the normalised error of all quantities and n, ``unknowns`` on average where the stated covariance is
     right, and within ``nees_band`` of that in 997 studies of 1000;
     ``within_3_sigma`` is the share of all errors of quantities that are, 0.9973 if normal, and ``largest_z`` the
@@ -56,28 +57,27 @@ def run_rigs(
         bar = bars.start("calibrate rigs", total=len(points) * sampling.runs)
         for index, conditions in enumerate(points):
             torch.manual_seed(sampling.seed * len(points) + index)
-            batches, information = [], []
+            batches = []
             for first in range(0, sampling.runs, _BATCH):
                 count = min(_BATCH, sampling.runs - first)
                 scans = rig_scans(drawn, board, conditions, count)
                 solution = solve_rig(scans.sightings, prior, config)
-                batches.append(_figures(solution, scans.truth, shape))
-                information.append(information_of_corners(scans, drawn))
+                least = drawn.root @ least_factor(information_of_corners(scans, drawn), conditions.off)
+                bound_mm = shape.stated_mm(prior.over_sigma(least.mT).mT)
+                batches.append(_figures(solution, scans.truth, shape, bound_mm))
                 bars.advance(bar, count)
-            least = drawn.root @ least_factor(torch.cat(information), conditions.off)
-            bound_mm = shape.stated_mm(prior.over_sigma(least.mT).mT)
-            merits = _merits(polars.concat(batches), 1e3 * float(bound_mm))
-            rows.append({**asdict(conditions), "runs": sampling.runs, **merits})
+            rows.append({**asdict(conditions), "runs": sampling.runs, **_merits(polars.concat(batches))})
     return polars.DataFrame(rows, infer_schema_length=None)
 
 
-def _figures(solution: RigSolution, truth: Shared, shape: HeightShape) -> polars.DataFrame:
+def _figures(solution: RigSolution, truth: Shared, shape: HeightShape, bound_mm: Tensor) -> polars.DataFrame:
     """One row per run."""
     error, covariance = solution.shared.vector - truth.vector, solution.covariance
     z = (error / covariance.diagonal(dim1=-2, dim2=-1).sqrt()).abs()
     columns = {
         "bend_um": 1e3 * shape.bend_mm(solution.model.prior.over_sigma(error)),
         "stated_um": 1e3 * shape.stated_mm(solution.factor),
+        "bound_um": 1e3 * bound_mm,
         "nees": (error * torch.linalg.solve(covariance, error)).sum(-1),
         "within_3_sigma": (z <= 3).double().mean(-1),
         "largest_z": z.amax(-1),
@@ -87,14 +87,14 @@ def _figures(solution: RigSolution, truth: Shared, shape: HeightShape) -> polars
     return polars.DataFrame({name: values.numpy() for name, values in columns.items()})
 
 
-def _merits(runs: polars.DataFrame, bound_um: float) -> dict[str, float]:
+def _merits(runs: polars.DataFrame) -> dict[str, float]:
     """Figures of merit over the runs of one point."""
-    bend, stated = ((polars.col(name) ** 2).mean().sqrt() for name in ("bend_um", "stated_um"))
+    bend, stated, bound = ((polars.col(name) ** 2).mean().sqrt() for name in ("bend_um", "stated_um", "bound_um"))
     found = runs.select(
         bend.alias("height_error_um"),
         stated.alias("stated_um"),
-        polars.lit(bound_um).alias("bound_um"),
-        (bend / bound_um).alias("over_bound"),
+        bound.alias("bound_um"),
+        (bend / bound).alias("over_bound"),
         polars.col("nees").mean(),
         polars.col("within_3_sigma").mean(),
         polars.col("largest_z").max(),

@@ -59,7 +59,8 @@ class BoardEdges:
     A crossing is a point of the straight edge from ``start`` to ``stop`` in the board frame, mm, but it is not known
     which. ``points`` are the measured (x, travel, z), mm; ``by_column`` is the derivative of (x, z) by the mean of the
     columns in both images and by the disparity, mm/px; ``sigma_px`` is how well single crossings are located, up to a
-    common factor. ``segment`` is a number of the edge, ``line`` that of the line.
+    common factor. ``segment`` is a number of the edge, ``line`` that of the line. ``later_mm`` is the travel after
+    which the right camera saw the point; None where both see it at once.
     """
 
     scan: str
@@ -70,6 +71,7 @@ class BoardEdges:
     stop: Float[Tensor, "crossings 3"]
     segment: Int[Tensor, " crossings"]
     line: Int[Tensor, " crossings"]
+    later_mm: Float[Tensor, " crossings"] | None = None
 
 
 @dataclass(frozen=True)

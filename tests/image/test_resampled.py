@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from lsvision.geometry import line_at, travel_at
-from lsvision.image.resampled import ColumnMap, ResampledImage, ShearedRows
+from lsvision.image.resampled import ResampledImage, ShearedRows
 from lsvision.types import TensorImage, Travel
 
 LINES, WIDTH = 90, 300
@@ -106,12 +106,3 @@ def test_rows_beside_missing_lines_are_missing():
     (missing,) = image.missing
     assert set(touched) <= set(missing)
     assert len(missing) <= len(touched) + 8
-
-
-def test_columns_between_whole_ones_lie_between_their_places():
-    places = torch.linspace(0, 10, 30, dtype=torch.float64).square()
-    found = ColumnMap(places)(torch.tensor([0.0, 3.5, 29.0, torch.nan, 30.0]))
-    expected = torch.stack(
-        [places[0], places[3:5].mean(), places[29], places[0] * torch.nan, 2 * places[29] - places[28]]
-    )
-    torch.testing.assert_close(found, expected.float(), equal_nan=True)

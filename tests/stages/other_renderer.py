@@ -36,9 +36,15 @@ def true_motion(scan: Scan) -> Tensor:
 
 def true_points(scan: Scan) -> Tensor:
     """True (x, travel, z), mm, of the corners."""
+    rotation, translation = true_pose(scan)
+    return scan_position(transform(rotation, translation, BOARD.corner_points()), true_motion(scan))
+
+
+def true_pose(scan: Scan) -> tuple[Tensor, Tensor]:
+    """R and T of the board."""
     truth = _truth(scan)
     rotation, translation = (torch.tensor(truth[key], dtype=torch.float64) for key in ("R", "T"))
-    return scan_position(transform(rotation, translation, BOARD.corner_points()), true_motion(scan))
+    return rotation, translation
 
 
 def _truth(scan: Scan) -> dict:

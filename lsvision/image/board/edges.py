@@ -12,7 +12,7 @@ import math
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, Real
 from torch import Tensor
 
 from lsvision.image.brightness import gray
@@ -49,8 +49,8 @@ class EdgeSegments:
         usable = torch.isfinite(low + high) & ~flat
         return torch.where(usable[:, None], torch.stack([low + rim, high - rim], -1), high.new_tensor([1.0, 0.0]))
 
-    def column_at(self, segment: Int[Tensor, " crossings"], line: Int[Tensor, " crossings"]) -> Tensor:
-        """Column of the chord on a line."""
+    def column_at(self, segment: Int[Tensor, " crossings"], line: Real[Tensor, " crossings"]) -> Tensor:
+        """Column of the chord on a (fractional) line."""
         start, stop = self.start[segment], self.stop[segment]
         return torch.lerp(start[:, 0], stop[:, 0], (line - start[:, 1]) / (stop[:, 1] - start[:, 1]))
 

@@ -13,8 +13,8 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from lsvision.geometry import ProductFrame, Rectification, color_rows, color_shift, registered_rows
+from lsvision.image.column_map import ColumnMap
 from lsvision.image.missing import missing_mask, missing_near
-from lsvision.image.resampled import ColumnMap
 from lsvision.image.resampling import Sampling, sample_image, sampling_reach
 from lsvision.stages.correction.config import CorrectionConfig
 from lsvision.stages.correction.locate import SeenCells
@@ -50,16 +50,15 @@ class ColorLines:
     registered: Sequence[float] = ()
     raw_columns: ColumnMap | None = None
 
-    def sample(self, image: Tensor, seen: SeenCells, out: Tensor) -> None:
+    def sample(self, image: Tensor, seen: SeenCells, in_image: Tensor, out: Tensor) -> None:
         """Write the colours of cells, ``(rows, columns, channels)``, to ``out``.
 
         Args:
-            image: the lines ``image_range`` of the left image.
+            image: the lines ``image_range`` of the left image. in_image: the cells' columns there.
         """
         if self.shift_mm is None or self.rows is None:
             first_line = seen.first_line - self.image_range[0]
-            column = self.in_image(seen.column)
-            sample_image(image, column, seen.line, self.sampling, first_line=first_line, out=out)
+            sample_image(image, in_image, seen.line, self.sampling, first_line=first_line, out=out)
             return
         begin = seen.first_line - self.start
         base = seen.line.nan_to_num().floor().clamp(-begin, self.rows.shape[1] - 2 - begin)
@@ -91,7 +90,7 @@ def color_lines(scan: Scan, frame: ProductFrame, lines: tuple[int, int], samplin
     reach = sampling_reach(sampling.coarser[0])
     shift = color_shift(scan)
     rectification = Rectification.of(scan.raw_rig)
-    raw_columns = None if rectification is None else ColumnMap(rectification.raw_left_columns)
+    raw_columns = None if rectification is None else ColumnMap.of(rectification.raw_left_columns)
     if shift is None:
         image_range = max(lines[0] - reach, 0), min(lines[1] + reach, scan.lines)
         return ColorLines(frame, lines[0], image_range, sampling, raw_columns=raw_columns)

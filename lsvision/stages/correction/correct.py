@@ -14,7 +14,7 @@ from torch import Tensor
 from lsvision.geometry import ProductFrame, depth_sigma, depth_step_mm, zero_disparity_mm
 from lsvision.image.resampling import SAMPLED_TILES
 from lsvision.image.tiling import TILE, in_parallel, tiles
-from lsvision.stages.correction.color_lines import ColorLines, color_lines, lines_without_colors, sampling_for
+from lsvision.stages.correction.color_lines import color_lines, lines_without_colors, sampling_for
 from lsvision.stages.correction.config import CorrectionConfig
 from lsvision.stages.correction.grid import plan_product, source_dtype
 from lsvision.stages.correction.locate import Locator, SeenCells, cell_spacing
@@ -114,8 +114,10 @@ class Correction:
             tile_rows, columns = tile
             seen = self.locator.locate(lines, (rows[0] + tile_rows.start, rows[0] + tile_rows.stop), columns)
             if seen is not None:
-                self._sample_colors(colors, image, seen, strip.color[tile])
-                self._fill_heights(colors, seen, strip, tile)
+                in_image = colors.in_image(seen.column)
+                for part in tiles(len(in_image), in_image.shape[1], SAMPLED_TILES[self.config.resampler]):
+                    colors.sample(image, seen.part(*part), in_image[part], strip.color[tile][part])
+                self._fill_heights(in_image, seen, strip, tile)
 
         # Where cells are coarse, fewer rows hold as many lines as a place can be counted through.
         size = min(TILE[0], max(1, int(_TILE_LINES / self.locator.spacing[0]))), TILE[1]
@@ -130,19 +132,13 @@ class Correction:
         sampling = sampling_for(self.config, cell_spacing(self.frame, self.grid))
         return DepthWithoutLines(self.depth, lines_without_colors(self.scan, self.frame, sampling))
 
-    def _sample_colors(self, colors: ColorLines, image: Tensor, seen: SeenCells, out: Tensor) -> None:
-        for part in tiles(len(out), out.shape[1], SAMPLED_TILES[self.config.resampler]):
-            colors.sample(image, seen.part(*part), out[part])
-
-    def _fill_heights(
-        self, colors: ColorLines, seen: SeenCells, strip: ProductStrip, tile: tuple[slice, slice]
-    ) -> None:
+    def _fill_heights(self, in_image: Tensor, seen: SeenCells, strip: ProductStrip, tile: tuple[slice, slice]) -> None:
         """Write everything but the colours of a tile to the strip."""
         height = seen.relief + self.frame.height_over_relief_mm
         strip.valid[tile] = seen.measured
         strip.height[tile] = height.masked_fill_(~seen.measured, torch.nan)
         line = seen.line.to(strip.source.dtype) + seen.first_line
-        strip.source[tile][..., 0], strip.source[tile][..., 1] = line, colors.in_image(seen.column)
+        strip.source[tile][..., 0], strip.source[tile][..., 1] = line, in_image
         if strip.sigma is not None:
             strip.sigma[tile] = self._position_sigma(seen).masked_fill_(~seen.measured[..., None], torch.nan)
 

@@ -86,7 +86,6 @@ class RectifiedPair:
         columns = self.rectification.matched_columns
         z = match.disparity.new_empty(stop - start, len(columns.places))
         sigma = torch.empty_like(z)
-        lines = torch.arange(start, stop, dtype=torch.float64)
         seen, last = self._seen_by_right(), self.rectification.raw_width - 1
 
         def fill(tile: tuple[slice, slice]) -> None:
@@ -95,8 +94,9 @@ class RectifiedPair:
             first = int(part.places[0])
             wanted = slice(first, int(part.places[-1]) + 2)
             # The shear of a column is that of the nearest one: it changes by less than a hundredth of a line.
-            row = self.left_rows.rows_of(lines[tile[0]], part.places.round().long().clamp(0, last)) - rows.start
-            maps = [at.to(torch.float32).numpy() for at in torch.broadcast_tensors(part.places - first, row)]
+            near = part.places.round().long().clamp(0, last)
+            row = self.left_rows.rows_after(rows.start, range(start + tile[0].start, start + tile[0].stop), near)
+            maps = [at.contiguous().numpy() for at in torch.broadcast_tensors((part.places - first).float(), row)]
             found = _at(match.disparity[:, wanted], maps, cv2.INTER_LINEAR)
             nearest = _at(match.disparity[:, wanted], maps, cv2.INTER_NEAREST)
             one_surface = (found - nearest).abs() <= _STEP_PX  # false beside a hole

@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from lsvision.estimation import SharedSignal
+from lsvision.estimation import NORMAL_OVER_MAD, SharedSignal
 from lsvision.stages.line_motion.color_differences import ColorDifferences
 
 _LEAST_SHARE = 0.5  # of the lines of a knot that must be measured
@@ -99,7 +99,7 @@ def shared_signal(
 def _no_outliers(values: Float[Tensor, " lines"]) -> Bool[Tensor, " lines"]:
     """Which values are no spikes."""
     off = (values - values.nanmedian()).abs()
-    return off <= _CUT * 1.4826 * off.nanmedian()
+    return off <= _CUT * NORMAL_OVER_MAD * off.nanmedian()
 
 
 def _long_wave_sigma(errors: Float[Tensor, " knots"]) -> float:

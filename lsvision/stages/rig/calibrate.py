@@ -52,7 +52,7 @@ def calibrate_rig(sightings: Sightings, scans: Sequence[str], rig: RawRig, confi
     held_out = HeldOut.of(still, config) if config.held_out and still.sightings.boards >= FEWEST_BOARDS else None
     contradicting = _contradicting(still, scans, held_out)
     # One scan that contradicts all others is no vibration: line motion would hide which it is.
-    shaken = ShakenSolution(still, ()) if contradicting else allow_for_line_motion(still, config)
+    shaken = ShakenSolution(still, ()) if contradicting else allow_for_line_motion(still, sightings, config)
     solution, held_out = _finite(shaken.solution, scans), None if shaken.errors else held_out
     shared = solution.shared
     depth_range_mm = config.depth_range_mm or sharp_depth_mm(ideal_rig(rig))

@@ -20,18 +20,19 @@ from torch import Tensor
 from lsvision.estimation import jacobian
 from lsvision.estimation.gaussian_process import covariance_root
 from lsvision.geometry import RawPair
-from lsvision.stages.calibration.along_scan import COMPONENTS, FINE, Travel, covariance_of, latents
+from lsvision.stages.calibration.along_scan import COMPONENTS, FINE, Travel, latents
 from lsvision.stages.calibration.batch import errors_along_scan_of
 from lsvision.stages.calibration.config import CalibrationConfig
 from lsvision.stages.calibration.measurements import BoardMeasurements
 from lsvision.stages.calibration.solved import Solution, solve
 from lsvision.stages.rig.config import RigConfig
-from lsvision.stages.rig.sightings import CameraSighting
+from lsvision.stages.rig.sightings import CameraSighting, Sightings
 from lsvision.stages.rig.solve import RigSolution, fit_rig, noise_scale_of
 from lsvision.types import ErrorAlongScan
 
 _ROUNDS = 2
 _SUSPECT = 1.2  # noise scale from which lines may have moved
+_MOST_OUTLIERS = 0.02  # of the corners: more were left out because a model without motion does not fit
 
 
 @dataclass(frozen=True)
@@ -42,19 +43,34 @@ class ShakenSolution:
     errors: tuple[ErrorAlongScan, ...]
 
 
-def allow_for_line_motion(solution: RigSolution, config: RigConfig) -> ShakenSolution:
-    """The solution of one problem again, with the motion of its boards' lines where the corners show one."""
+def allow_for_line_motion(solution: RigSolution, sightings: Sightings, config: RigConfig) -> ShakenSolution:
+    """The solution of one problem again, with the motion of its boards' lines where the corners show one.
+
+    Args:
+        sightings: all corners: those that a vibration displaces most are no outliers.
+    """
     errors: tuple[ErrorAlongScan, ...] = ()
     if float(solution.noise_scale) < _SUSPECT or not bool(solution.found.converged):
         return ShakenSolution(solution, errors)
+    still = solution
+    if int(still.outliers.sum()) > _MOST_OUTLIERS * int(sightings.valid.sum()):
+        solution = replace(still, sightings=sightings, outliers=torch.zeros_like(still.outliers))
     for _ in range(_ROUNDS):
         options = CalibrationConfig(prior_sigma=config.motion_sigma, correlated_odds=config.correlated_odds)
         by_points = solve(_measured(solution), options)
         if not bool(by_points.along_scan.found):
             break
         errors = errors_along_scan_of(by_points.summary())
+        solution = _without_left_out(solution, by_points)
         solution = _fitted_again(solution, _along(solution, by_points), config)
-    return ShakenSolution(solution, errors)
+    return ShakenSolution(solution if errors else still, errors)
+
+
+def _without_left_out(solution: RigSolution, by_points: Solution) -> RigSolution:
+    """The solution less the corners that the search for the motion left out: it says nothing of how they moved."""
+    left_out = solution.sightings.valid & ~by_points.problem.valid
+    kept = replace(solution.sightings, valid=solution.sightings.valid & ~left_out)
+    return replace(solution, sightings=kept, outliers=solution.outliers + left_out.sum(-1))
 
 
 def _fitted_again(solution: RigSolution, along: Float[Tensor, "boards rows rows"], config: RigConfig) -> RigSolution:
@@ -84,7 +100,7 @@ def _measured(solution: RigSolution) -> BoardMeasurements:
 
 def _along(solution: RigSolution, by_points: Solution) -> Float[Tensor, "boards rows rows"]:
     """Factor of the covariance of each board's residuals, in sigmas."""
-    roots = covariance_root(covariance_of(by_points.along_scan.variances, FINE))[None]
+    roots = covariance_root(by_points.along_scan.spectrum.covariance(FINE))[None]
     rows = torch.cat(
         [
             _by_latents(solution, by_points, eye, by_place, roots)

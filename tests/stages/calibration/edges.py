@@ -23,8 +23,11 @@ Motion = Callable[[Tensor], Tensor]
 """Takes travel ``(boards, points)`` to (δx, δz, ρ, δy)."""
 
 
-def edges_of(corners: Corners, motion: Motion, pitch_mm: float = 0.6) -> list[BoardEdges]:
-    """The edges along Y of every board, with white noise of the mean column and of the disparity."""
+def edges_of(corners: Corners, motion: Motion, pitch_mm: float = 0.6, later_mm: float = 0.0) -> list[BoardEdges]:
+    """The edges along Y of every board, with white noise of the mean column and of the disparity.
+
+    The right camera sees them ``later_mm`` after the left one.
+    """
     grid = corners.board_points[0].unflatten(0, (8, 11))
     start, stop = grid[:-1].flatten(0, 1), grid[1:].flatten(0, 1)
     boards = []
@@ -37,15 +40,17 @@ def edges_of(corners: Corners, motion: Motion, pitch_mm: float = 0.6) -> list[Bo
         share = (lines * pitch_mm - ends[0][:, 1:2]) / (ends[1][:, 1:2] - ends[0][:, 1:2])
         segment, index = ((share > 0.2) & (share < 0.8)).nonzero().unbind(-1)
         still = torch.lerp(ends[0][segment], ends[1][segment], share[segment, index][:, None])
-        boards.append(_seen(board, still, (start[segment], stop[segment]), (segment, lines[index]), motion))
+        boards.append(_seen(board, still, (start[segment], stop[segment]), (segment, lines[index]), motion, later_mm))
     return boards
 
 
-def _seen(board: int, still: Tensor, ends, numbers, motion: Motion) -> BoardEdges:
+def _seen(board: int, still: Tensor, ends, numbers, motion: Motion, later_mm: float) -> BoardEdges:
     travel = still[:, 1].expand(board + 1, -1)  # of the boards up to this one, as the motion is drawn board by board
-    x, z = shaken(still[:, ::2], motion(travel)[board], middle_point(RIG)).unbind(-1)
-    left, right = project(RIG, x, z)
-    noise = torch.randn(2, len(x), dtype=torch.float64)
+    left, right = (
+        project(RIG, *shaken(still[:, ::2], motion(travel + later)[board], middle_point(RIG)).unbind(-1))[camera]
+        for camera, later in enumerate((0.0, later_mm))
+    )
+    noise = torch.randn(2, len(left), dtype=torch.float64)
     column, disparity = COLUMN_SIGMA * noise[0], DISPARITY_SIGMA * noise[1]
     left, right = left + column + disparity / 2, right + column - disparity / 2
     by_left, by_disparity = triangulation_jacobian(RIG, left, left - right).unbind(-1)
@@ -59,6 +64,7 @@ def _seen(board: int, still: Tensor, ends, numbers, motion: Motion) -> BoardEdge
         stop=ends[1],
         segment=numbers[0],
         line=numbers[1],
+        later_mm=torch.full_like(x, later_mm) if later_mm else None,
     )
 
 

@@ -8,10 +8,7 @@ import torch
 from torch.nn.functional import pad
 
 from lsvision.geometry import middle_point, scan_position, shaken, transform, without_trend
-from lsvision.stages.calibration.along_scan import Linearised, edge_rows, search_with_edges
-from lsvision.stages.calibration.along_scan.evidence import NormalEquations
-from lsvision.stages.calibration.along_scan.kernels import FINE, covariance_of, kernel_family
-from lsvision.stages.calibration.along_scan.search import evidence_by_component
+from lsvision.stages.calibration.along_scan import edge_rows
 from lsvision.stages.calibration.calibrate import calibrate
 from lsvision.stages.calibration.config import CalibrationConfig
 from lsvision.stages.calibration.problem import BoardProblem, BoardState
@@ -129,24 +126,6 @@ def test_errors_that_last_along_an_edge_weigh_less():
     assert 0.1 < float(lost[0] / lost[1]) < 0.8
 
 
-def test_no_step_of_the_search_lowers_the_likelihood(monkeypatch):
-    corners, motion = shaken_boards(4, TWO_TILTS)
-    problem, state = at_truth(corners)
-    edges = edge_rows(problem, state, edges_of(corners, motion))
-    linearised = Linearised.of(problem, state, prior_sigma=0.05)
-    before = -math.inf
-    for steps in (1, 3, 6, 12, 20):
-        monkeypatch.setattr("lsvision.stages.calibration.along_scan.all_kernels._STEPS", steps)
-        found = search_with_edges(problem, linearised, edges)
-        assert found.log_evidence > before
-        before = found.log_evidence
-    equations = NormalEquations.of(problem, linearised, FINE, edges)
-    one = torch.zeros(4, len(kernel_family(FINE).log_prior), dtype=torch.float64)
-    one[0, 4] = one[2, 4] = one[3, 4] = 0.09  # a broad band instead
-    other, _ = evidence_by_component(equations, covariance_of(one, FINE)[None])
-    assert found.log_evidence > float(other) + 100
-
-
 @pytest.mark.slow
 def test_edges_show_every_line_and_sharpen_n():
     ratios, distances = [], []
@@ -189,3 +168,15 @@ def test_scans_without_edges_are_solved_by_their_corners():
     assert torch.equal(plain.motion.n, without.motion.n)
     for ours, theirs in zip(plain.line_motions, without.line_motions, strict=True):
         assert torch.equal(ours.values, theirs.values)
+
+
+def test_the_right_camera_sees_a_motion_when_it_looks():
+    """A crossing whose partner is seen two millimetres later: two moments of the vibration, one of the edge."""
+    corners, motion = shaken_boards(0, TWO_TILTS)
+    problem, state = at_truth(corners)
+    edges = edges_of(corners, motion, later_mm=2.0)
+    known = edge_rows(problem, state, edges).sigma_px
+    expected = torch.tensor([COLUMN_SIGMA, DISPARITY_SIGMA], dtype=torch.float64).expand(2, -1)
+    torch.testing.assert_close(known, expected, rtol=0.1, atol=0)
+    at_once = edge_rows(problem, state, [dataclasses.replace(found, later_mm=None) for found in edges]).sigma_px
+    assert float((at_once / known)[:, 0].min()) > 1.3

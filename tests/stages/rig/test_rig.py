@@ -160,3 +160,17 @@ def test_another_renderers_raw_boards(shared_data):
     assert found.noise_scale < 1.2
     shape = HeightShape.of(rig, Shared(true[:QUANTITIES], true[QUANTITIES:]), RigPrior.of(rig, CONFIG).sigma, 52.0)
     assert 1e3 * float(shape.bend_mm(off / RigPrior.of(rig, CONFIG).sigma)) < 2 * found.height_error_um
+
+
+@pytest.mark.parametrize("k2", [(0.05, 0.05), (0.2, -0.1)])
+def test_a_rig_that_is_off_in_k2_alone(k2):
+    """It is estimated, four of the data sheet's sigmas away as well, and all that is stated holds."""
+    quantities = quantities_of(DATA_SHEET)
+    quantities[4], quantities[9] = k2
+    truth = Truth(quantities[None], torch.tensor([[0.0, 1.0, 0.0]], dtype=torch.float64))
+    found = calibrated(first_of(truth.scanned(8)), held_out=False)
+    off = torch.cat([quantities_of(found.rig), found.motion.n]) - truth.vector[0]
+    assert (found.verdict, found.noise_scale < 1.1) == ("determined", True)
+    assert float((off / found.covariance.diagonal().sqrt()).abs().max()) < 3.5
+    assert dict(found.rig.sigma)["left.distortion.1"] < 0.005
+    assert 1e3 * float(shape_at(truth).bend_mm(off / PRIOR.sigma)) < min(10.0, 2.5 * found.height_error_um)

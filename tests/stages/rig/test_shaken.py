@@ -57,8 +57,9 @@ def errors(runs: int, boards: int = 8, size=(0.5, 0.5, 0.02)) -> list[dict[str, 
     found = []
     for _ in range(runs):
         truth = Truth.drawn(1)
-        white = solve_rig(shaken_sightings(truth, boards, *size), PRIOR, CONFIG)
-        shaken = allow_for_line_motion(white, CONFIG)
+        sightings = shaken_sightings(truth, boards, *size)
+        white = solve_rig(sightings, PRIOR, CONFIG)
+        shaken = allow_for_line_motion(white, sightings, CONFIG)
         shape = HeightShape.of(DATA_SHEET, Shared(truth.quantities[0], truth.n[0]), PRIOR.sigma, 52.0)
         row = {}
         for name, solution in (("white", white), ("along", shaken.solution)):
@@ -82,3 +83,27 @@ def test_shaken_boards_calibrate_a_rig():
     assert found.noise_scale < 1.3
     assert found.verdict in ("determined", "prior-dominated")
     assert {error.component for error in found.errors_along_scan} >= {"x", "z"}
+
+
+@pytest.mark.slow
+def test_sigmas_of_shaken_rigs_are_those_of_the_errors():
+    """Corners that the search for the motion leaves out, taken for still, made squared errors of thousands."""
+    found = errors(10)
+    nees = torch.tensor([row["along_nees"] for row in found])
+    assert 17 - 5.6 < float(nees.mean()) < 17 + 5.6  # 3 sqrt(2 * 17 / 10)
+    bends, stated = (
+        torch.tensor([row[name] for row in found]).square().mean().sqrt() for name in ("along_um", "along_stated_um")
+    )
+    assert float(bends) < float(stated) < 20.0
+    assert max(row["along_noise"] for row in found) < 1.2
+
+
+@pytest.mark.slow
+def test_no_corner_is_an_outlier_because_its_line_moved():
+    truth = Truth.drawn(1)
+    sightings = shaken_sightings(truth, 8, 0.5, 0.5, 0.02)
+    white = solve_rig(sightings, PRIOR, CONFIG)
+    shaken = allow_for_line_motion(white, sightings, CONFIG).solution
+    assert int(white.outliers.sum()) > 50
+    assert int(shaken.outliers.sum()) < 20
+    assert torch.equal(shaken.outliers, sightings.valid.sum(-1) - shaken.sightings.valid.sum(-1))

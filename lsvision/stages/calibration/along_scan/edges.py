@@ -32,6 +32,7 @@ _OUTLYING = 5.0  # sigmas
 _LONGEST = 40  # lines over which errors of an edge are followed
 _UNCORRELATED = 0.05
 _FEWEST = 200  # crossings of a scan
+_FREE = (10.0, 10.0, 10.0, 0.05)  # mm and rad: motion of x, travel and z, and roll, that is as good as free
 _RANK = 1e-9  # of the largest singular value
 
 
@@ -81,12 +82,16 @@ def edge_rows(problem: BoardProblem, state: Float[Tensor, " state"], edges: Sequ
 
 @dataclass(frozen=True)
 class _Crossings:
-    """Crossings of one board: ``whitener`` takes measured displacements to errors of mean column and disparity."""
+    """Crossings of one board: ``whitener`` takes measured displacements to errors of mean column and disparity.
+
+    ``place`` is where the left camera saw them along the scan, ``place_right`` where the right one did; None: there.
+    """
 
     found: BoardEdges
     whitener: Float[Tensor, "crossings 2 3"]
     by_component: Float[Tensor, "crossings 2 4"]
     place: Float[Tensor, " crossings"]
+    place_right: Float[Tensor, " crossings"] | None
     features: Float[Tensor, "crossings 4"]
     kept: Bool[Tensor, " crossings"]
 
@@ -108,8 +113,10 @@ class _Crossings:
         return cls(
             found=found,
             whitener=whitener,
-            by_component=whitener @ one.directions(found.points[None])[0].mT,
+            # About places on the edges, not measured ones: a motion must not fit the noise of its own lever.
+            by_component=whitener @ one.directions(torch.lerp(start, stop, share)[None])[0].mT,
             place=place,
+            place_right=None if found.later_mm is None else place + found.later_mm / travel.extent_mm,
             features=affine_features(body),
             # The knots end where the corners do that were used.
             kept=torch.isfinite(whitener).all((-2, -1)) & (place >= 0.0) & (place <= 1.0),
@@ -133,8 +140,13 @@ class _Crossings:
         return rows, variance.sqrt() * self.found.sigma_px[self.kept].square().mean().sqrt()
 
     def fitted(self, sigma: Float[Tensor, "2"]) -> Tensor:
-        """Unknowns, all free, that fit the crossings best."""
-        rows = self.reduced(sigma)
+        """Unknowns, all as good as free, that fit the crossings best.
+
+        Columns hardly change where an object is moved away along a camera's rays. Where the cameras look at different
+        moments, a motion of metres from knot to knot would fit any columns, and their noise.
+        """
+        bound = sigma.new_tensor(_FREE).reciprocal().repeat_interleave(FINE.count)
+        rows = torch.cat([self.reduced(sigma), pad(bound.diag(), (0, MAP + 1))])
         return torch.linalg.lstsq(rows[:, :-1], rows[:, -1:], rcond=_RANK, driver="gelsd").solution
 
     def residuals(self, unknowns: Tensor) -> Float[Tensor, "crossings 2"]:
@@ -160,11 +172,21 @@ class _Crossings:
 
     def _rows(self, piece: slice) -> Tensor:
         """Rows ``(crossings, 2, columns)`` on the processes at the knots, the map and 1."""
-        weights, whitener = FINE.weights(self.place[piece]), self.whitener[piece]
-        by_process = (self.by_component[piece][..., None] * weights[:, None, None]).flatten(-2)
+        whitener, by_process = self.whitener[piece], self._by_process(piece).flatten(-2)
         by_map = (self.features[piece][:, None, :, None] * whitener[:, :, None]).flatten(-2)
         measured = whitener @ self.found.points[piece][..., None]
         return torch.cat([by_process, by_map, measured], dim=-1)
+
+    def _by_process(self, piece: slice) -> Float[Tensor, "crossings 2 4 knots"]:
+        """What the processes at the knots do to mean column and disparity: to each column, when its camera sees it."""
+        by_component, weights = self.by_component[piece][..., None], FINE.weights(self.place[piece])[:, None, None]
+        if self.place_right is None:
+            return by_component * weights
+        mean, disparity = by_component.split(1, dim=1)
+        left, right = mean + disparity / 2, mean - disparity / 2
+        later = FINE.weights(self.place_right[piece])[:, None, None]
+        left, right = left * weights, right * later
+        return torch.cat([(left + right) / 2, left - right], dim=1)
 
     def _lasting(self, error: Float[Tensor, " crossings"]) -> Tensor:
         """Over how many lines errors along an edge last: the variance of a mean over that of as many single ones."""
