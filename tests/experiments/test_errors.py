@@ -96,6 +96,7 @@ def test_an_option_out_of_range_is_one_line(overrides, problem, command, capsys)
     assert line.startswith(f"error: {problem}expected ")
 
 
+@pytest.mark.slow
 def test_an_option_out_of_range_ends_the_program_with_one_line(tmp_path):
     options = ["+experiment=validate", "product=x", "threads=0", f"hydra.run.dir={tmp_path}"]
     arguments = [sys.executable, "-m", "lsvision.run", *options]

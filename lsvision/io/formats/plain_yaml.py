@@ -1,6 +1,8 @@
 """YAML as plain data: a small part of the language, in which a file of any content costs little."""
 
+import copy
 import re
+from functools import lru_cache
 from typing import Any
 
 import yaml
@@ -95,6 +97,12 @@ def load_plain_yaml(text: str) -> object:
     Raises:
         ValueError: not YAML, or more than plain data; says where and what, and repeats no more of the text than a key.
     """
+    return copy.deepcopy(_parsed(text))
+
+
+@lru_cache(maxsize=16)
+def _parsed(text: str) -> object:
+    """Parsed once: every strip of an archive looks whether its scan is still what it was."""
     try:
         loader = PlainLoader(text)
         data: object = loader.get_single_data()

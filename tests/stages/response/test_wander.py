@@ -39,7 +39,7 @@ def wandering(rms: float, lines: int = 6000, seed: int = 0) -> tuple[WanderGains
     return sums.gains(), gain.double().log()
 
 
-@pytest.mark.parametrize("rms", [3.0, 5.0])
+@pytest.mark.parametrize("rms", [3.0, pytest.param(5.0, marks=pytest.mark.slow)])
 def test_fine_gains_come_back_within_one_percent_with_honest_sigma(rms):
     found, truth = wandering(rms)
     off = (found.log_gain - _without_long(truth, found.observed_px))[20:-20]
