@@ -50,7 +50,7 @@ def pytest_collection_finish() -> None:
 
 @pytest.fixture(autouse=True)
 def _seeded() -> None:
-    torch.manual_seed(0)
+    torch.default_generator.manual_seed(0)  # of the processor: torch.manual_seed takes a millisecond for the others
     torch.set_num_threads(1)
 
 
@@ -101,8 +101,12 @@ def quick_reports(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatc
 @pytest.fixture
 def command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, quick_reports: None) -> Callable[..., int]:
     """Run ``python -m lsvision.run`` in this process with overrides, in a folder of its own; returns the exit code."""
+    from hydra._internal.hydra import Hydra
+
     from lsvision import run
 
+    # Hydra composes everything twice, first to look for its mode, which no configuration of ours sets.
+    monkeypatch.setattr(Hydra, "get_mode", lambda *_, **__: None)
     monkeypatch.chdir(tmp_path)
 
     def call(*overrides: str, folder: str = "run") -> int:

@@ -14,6 +14,8 @@ import jaxtyping
 import torch
 
 _check_every_call = jaxtyping.jaxtyped
+# What each function was called with; a function within another is defined again and again, and checked once.
+_KNOWN: dict[tuple[str, str, int], set] = {}
 
 
 def install_checks(modules: list[str]) -> None:
@@ -35,7 +37,7 @@ def _check_every_shape(*, typechecker: Callable) -> Callable:
 
 def _once_for_every_shape(plain: Callable, typechecker: Callable) -> Callable:
     """A function that is checked where its arguments have types and shapes that it was not called with before."""
-    known = set()
+    known = _KNOWN.setdefault((plain.__module__, plain.__qualname__, plain.__code__.co_firstlineno), set())
 
     @functools.cache
     def checked() -> Callable:

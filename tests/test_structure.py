@@ -1,6 +1,7 @@
 """The house rules that a reader relies on, counted over the package: where formulas live, how large pieces are."""
 
 import ast
+import functools
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -16,6 +17,7 @@ NAMES_FIELDS = {"types/raw_rig.py", "types/scan.py", "io/formats/raw_rig.py", "i
 Function = ast.FunctionDef | ast.AsyncFunctionDef
 
 
+@functools.cache
 def modules() -> dict[str, ast.Module]:
     return {
         path.relative_to(PACKAGE).as_posix(): ast.parse(path.read_text(encoding="utf-8"))

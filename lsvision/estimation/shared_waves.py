@@ -29,10 +29,14 @@ _ROUNDS = 2  # of searching all parts in turn
 
 @dataclass(frozen=True)
 class SharedFit:
-    """The likeliest parts, and by how much the process a, and b, adds to the logarithm of the likelihood."""
+    """The likeliest parts, and by how much the process a, and b, adds to the logarithm of the likelihood.
+
+    With ``neighbours``, waves that periodograms show as one, the evidence, which is theirs, may be too small.
+    """
 
     parts: tuple[Part, ...]
     evidence: tuple[float, float]
+    neighbours: bool = False
 
     @property
     def model(self) -> SharedModel:
@@ -61,7 +65,7 @@ def fit_shares(data: SharedSignal, sigma: float, length: float) -> SharedFit:
     evidence = both.density - alone[0], both.density - alone[1]
     # The longer a signal, the fewer waves lie within a cycle of each other.
     parts = both.parts if waves.segments > 1 else with_neighbours(both.parts, data)
-    return SharedFit(parts, evidence)
+    return SharedFit(parts, evidence, neighbours=len(parts) > len(both.parts))
 
 
 @dataclass(frozen=True)

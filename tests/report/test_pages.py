@@ -115,11 +115,13 @@ def test_calibration_report(tmp_path, determined, corners):
     assert len(list((tmp_path / "figures").glob("*.png"))) == len(list((tmp_path / "figures").glob("*.svg"))) == 7
 
 
+@pytest.mark.usefixtures("quick_reports")
 def test_calibrations_without_a_guide_have_no_sketch(tmp_path, dominated, corners):
     calibration_report(dominated, [corners, corners], {}, tmp_path)
     assert "Align the cameras" not in (tmp_path / "report.html").read_text()
 
 
+@pytest.mark.usefixtures("quick_reports")
 def test_calibrations_with_a_guide_say_what_to_turn(tmp_path, determined, corners):
     guide = installation_guide(determined.motion, 0.05, Transported(0.07), InstallationConfig())
     calibration_report(dataclasses.replace(determined, installation=guide), [corners, corners], {}, tmp_path)

@@ -32,9 +32,10 @@ def _worst(simulation, whole, board):
 
 
 @pytest.mark.parametrize(("pitch", "roll", "yaw"), POSES)
-def test_corners_agree_with_the_model_to_a_hundredth_of_a_pixel(small_rig, board, whole, pitch, roll, yaw):
+def test_corners_agree_with_the_model_to_a_hundredth_of_a_pixel(full_rig, board, whole, pitch, roll, yaw):
     scene = SceneConfig(pitch_deg=pitch, roll_deg=roll, yaw_deg=yaw, board_texture=0.0)
-    simulation = simulate(small_rig, board, scene, SHARED_N, SensorConfig(noise=0.0, bits=16), Acquisition(0.56))
+    sensor = SensorConfig(noise=0.0, bits=16)
+    simulation = simulate(scaled_rig(full_rig, 16), board, scene, SHARED_N, sensor, Acquisition(1.12))
     assert _worst(simulation, whole, board) < 0.01
 
 

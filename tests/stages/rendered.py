@@ -1,11 +1,12 @@
 """Small rendered scans in memory, and the truth about their corners."""
 
+from functools import lru_cache
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
-from lsvision.geometry import scaled_rig, scan_position, transform
+from lsvision.geometry import Camera, scaled_rig, scan_position, transform
 from lsvision.simulation import (
     Acquisition,
     EncoderConfig,
@@ -26,6 +27,7 @@ TILTED = SceneConfig(pitch_deg=6.0, roll_deg=-4.0, yaw_deg=92.0)
 FINE_SENSOR = SensorConfig(supersampling=2)
 
 
+@lru_cache(maxsize=8)
 def simulation(
     scene: SceneConfig = TILTED, transport: Transport = "forward", encoder: EncoderConfig | None = None
 ) -> Simulation:
@@ -37,15 +39,25 @@ def simulation(
 
 def stereo_scan(source: Simulation) -> Scan:
     """The scan with both its images."""
-    left, right = (TensorImage(torch.cat(list(source.strips(camera)))) for camera in ("left", "right"))
+    left, right = (TensorImage(_image(source, camera).clone()) for camera in ("left", "right"))
     return Scan(Path("rendered"), source.rig, source.travel, StereoPair(left, right))
 
 
 def depth_scan(source: Simulation) -> Scan:
     """The scan as a camera that computes depth itself would store it."""
-    left = TensorImage(torch.cat(list(source.strips("left"))))
-    depth = TensorImage(torch.cat(list(source.depth_strips()))[..., None])
+    left, depth = TensorImage(_image(source, "left").clone()), TensorImage(_depth(source).clone())
     return Scan(Path("rendered"), source.rig, source.travel, DepthView(left, depth))
+
+
+@lru_cache(maxsize=8)
+def _image(source: Simulation, camera: Camera) -> Tensor:
+    """What a camera sees; rendered once for tests of the same scan."""
+    return torch.cat(list(source.strips(camera)))
+
+
+@lru_cache(maxsize=8)
+def _depth(source: Simulation) -> Tensor:
+    return torch.cat(list(source.depth_strips()))[..., None]
 
 
 def true_measurement(source: Simulation) -> Tensor:

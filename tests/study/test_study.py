@@ -258,8 +258,8 @@ def test_study_of_a_vibration_shows_by_wavelength_whether_sigma_covers_it(comman
     assert (tmp_path / "run" / "figures" / "coverage_vibration_wavelength_mm.svg").is_file()
 
 
-@pytest.mark.drawn
-def test_command_writes_tables_and_report(command, tmp_path):
+@pytest.mark.parametrize("_", ["blank", pytest.param("drawn", marks=[pytest.mark.drawn, pytest.mark.slow])])
+def test_command_writes_tables_and_report(command, tmp_path, _):
     axes = ("axes.boards=[one_tilted,two_tilted]", "axes.method=[joint,two_step]", "axes.angle_z_deg=[-1.0,1.0]")
     assert command("+experiment=study", *axes, "runs=4", "conditions.iterations=3", "map_steps=5") == 0
     folder = tmp_path / "run"

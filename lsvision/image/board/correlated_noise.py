@@ -1,9 +1,10 @@
 """Covariance of fitted corners where the noise of neighbouring pixels, or of the two images of a pair, is correlated.
 
 Printed texture is the same in both images and wider than a pixel, and a blurred or resampled image has no independent
-pixels at all. The noise of a board is taken as a sum of a few kinds: white, with Gaussian correlations of one to a few
-pixels, and white on the edges of the squares alone. What each of them would leave of its windows is known, so that the
-strengths follow from what the fits have left, as variance components do.
+pixels at all. A camera that shakes moves every line of its image by itself. The noise of a board is taken as a sum of a
+few kinds: white, with Gaussian correlations of one to a few pixels, shifts of lines, sideways and along the scan, and
+white on the edges of the squares alone. What each of them would leave of its windows is known, so that the strengths
+follow from what the fits have left, as variance components do.
 
 Source: Rao 1971, Estimation of variance and covariance components - MINQUE theory.
 """
@@ -18,6 +19,9 @@ from torch import Tensor
 from lsvision.image.board.residuals import Residuals
 
 _SCALES_PX = (1.0, 2.0, 4.0)  # of the correlations of neighbouring pixels
+_SHIFTS = slice(1 + len(_SCALES_PX), 3 + len(_SCALES_PX))  # the kinds that shift lines, sideways and along the scan
+_BEYOND_CHANCE = 4.0  # standard deviations
+_LEAST_SHARE = 0.2  # of the corners' variance: what the other kinds leave unexplained is like small shifts of lines
 _LARGEST_CORRELATION = 0.999
 _TRACED = 12  # windows of a board from which the expectation is taken: they are much alike
 
@@ -42,12 +46,10 @@ class Correlation:
         shift = (first.corner[:1] * 0 if first is second else second.corner - first.corner).to(dtype)
         lag = index[:, None] - index + shift.mT[..., None, None]  # u and v, fits, size, size
         box, wide = (1 - lag.abs()).clamp(min=0), [_bell(lag / scale) for scale in _SCALES_PX]
-        along_u, along_v = torch.stack([box, *wide, box], dim=1)
-        amplitudes = (
-            torch.stack([*[torch.ones_like(fits.residual)] * (1 + len(wide)), fits.steepness]).to(dtype)
-            for fits in (first, second)
-        )
-        return cls(along_v, along_u, *amplitudes)
+        # All pixels of a line are shifted alike, those of the next by another amount.
+        along_u = torch.stack([box[0], *(bell[0] for bell in wide), *[torch.ones_like(box[0])] * 2, box[0]])
+        along_v = torch.stack([box[1], *(bell[1] for bell in wide), *[box[1]] * 3])
+        return cls(along_v, along_u, *(_amplitudes(fits).to(dtype) for fits in (first, second)))
 
     def times(self, images: Float[Tensor, "fits rows pixels"]) -> Float[Tensor, "kinds fits rows pixels"]:
         """Each applied to images in the second window: images in the first."""
@@ -71,6 +73,13 @@ class Correlation:
         """Some of the fits."""
         places = slice(None) if self.along_u.shape[1] == 1 else fits
         return Correlation(self.along_v[:, places], self.along_u[:, places], self.first[:, fits], self.second[:, fits])
+
+
+def _amplitudes(fits: Residuals) -> Float[Tensor, "kinds fits pixels"]:
+    """Of each kind of noise in each pixel. A line that is shifted by one pixel changes by its gradient."""
+    even = torch.ones_like(fits.residual)
+    by_shift = fits.jacobian[:, :2].unbind(1)
+    return torch.stack([*[even] * (1 + len(_SCALES_PX)), *by_shift, fits.steepness])
 
 
 def _bell(x: Tensor) -> Tensor:
@@ -126,12 +135,43 @@ def noise_strength(first: Residuals, second: Residuals) -> Float[Tensor, " kinds
     # Sums over thousands of pixels: seven digits are plenty, and half the time.
     correlation = Correlation.between(first, second, torch.float32)
     left, right = first.residual.float(), second.residual.float()
-    found = (correlation.times(right[:, None])[:, :, 0] * left).sum((1, 2)).to(first.residual)
+    found = (correlation.times(right[:, None])[:, :, 0] * left).sum(-1).to(first.residual)
     every = slice(None, None, max(1, len(left) // _TRACED))
     some = first.of(every)
     others = some if first is second else second.of(every)
     expected = expected_products(some, others, correlation.of(every)).to(first.residual)
-    return nonnegative_solution(expected, found * (len(left[every]) / len(left)))
+    expected *= len(left) / len(left[every])
+    used = _beyond_chance(expected, found)
+    strength = _strength_of(used, expected, found)
+    if bool(used[_SHIFTS].any()) and _share_of_shifts(some, strength) < _LEAST_SHARE:
+        used[_SHIFTS] = False
+        return _strength_of(used, expected, found)
+    return strength
+
+
+def _strength_of(used: Bool[Tensor, " kinds"], expected: Tensor, found: Tensor) -> Float[Tensor, " kinds"]:
+    strength = torch.zeros(len(used), dtype=expected.dtype)
+    strength[used] = nonnegative_solution(expected[used][:, used], found.sum(1)[used])
+    return strength
+
+
+def _beyond_chance(
+    expected: Float[Tensor, "kinds kinds"], found: Float[Tensor, "kinds fits"]
+) -> Bool[Tensor, " kinds"]:
+    """All kinds, but shifts of lines only where the fits agree that there are such."""
+    inverse = torch.linalg.pinv(expected, hermitian=True)
+    chance = (inverse @ (found.shape[1] * torch.cov(found)) @ inverse).diagonal().clamp(min=0).sqrt()
+    used = inverse @ found.sum(1) > _BEYOND_CHANCE * chance
+    used[: _SHIFTS.start] = used[_SHIFTS.stop :] = True
+    return used
+
+
+def _share_of_shifts(fits: Residuals, strength: Float[Tensor, " kinds"]) -> float:
+    """Of the variance of the corners."""
+    without = strength.clone()
+    without[_SHIFTS] = 0
+    whole, rest = (corner_covariance(fits, fits, each).diagonal(dim1=-2, dim2=-1).sum() for each in (strength, without))
+    return float(1 - rest / whole)
 
 
 def corner_covariance(

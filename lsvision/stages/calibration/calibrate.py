@@ -21,6 +21,7 @@ from lsvision.stages.calibration.measurements import BoardMeasurements
 from lsvision.stages.calibration.misplaced import column_rows, largest_residuals
 from lsvision.stages.calibration.noise import board_chi_square
 from lsvision.stages.calibration.observability import Known, observe
+from lsvision.stages.calibration.readmitted import solve_readmitting
 from lsvision.stages.calibration.rig_errors import motion_by_rig, widened_by_rig
 from lsvision.stages.calibration.solved import Solution, solve
 from lsvision.stages.calibration.verdict import UNLIKE, judge, not_settled, rmse_grew
@@ -104,7 +105,7 @@ def _explained(
 ) -> _Explained:
     """Solve, with errors along the scan only where no other cause explains the residuals, then with the edges."""
     measured = _sound(boards)
-    solution = solve(measured, config)
+    solution = solve_readmitting(measured, config)
     assumed = Assumed(config.prior_sigma, config.board_scale_sigma)
     shaken = bool(solution.along_scan.found)
     findings = find_flaws(boards, solution.problem, solution.start, solution.outlying, assumed, shaken)

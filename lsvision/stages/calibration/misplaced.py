@@ -8,12 +8,11 @@ from torch import Tensor
 
 from lsvision.stages.calibration.model import residuals_in_sigmas
 from lsvision.stages.calibration.problem import BoardProblem
+from lsvision.stages.calibration.readmitted import MANY
 from lsvision.types import BoardCorners
 
 # Of a square: a corner this near another's place was taken for it.
 _AT_PLACE = 0.3
-# Of a board's corners: with more left out the board was not read well.
-_MANY = 0.1
 _NAMED = 3  # corners named one by one
 
 
@@ -42,7 +41,7 @@ def left_out(board: BoardCorners, outlying: Tensor) -> LeftOut | None:
     sentence = (
         f"scan {board.scan}: {count} of {seen} corners lie off their board and were left out: {'; '.join(named)}{more}"
     )
-    return LeftOut(sentence, count > _MANY * seen)
+    return LeftOut(sentence, count > MANY * seen)
 
 
 @dataclass(frozen=True)

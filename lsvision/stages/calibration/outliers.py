@@ -16,6 +16,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from lsvision.estimation import apply, chi_square_tail
+from lsvision.stages.calibration.measurements import BoardMeasurements, SoundProblem
 from lsvision.stages.calibration.problem import BoardProblem
 
 # Squared distance, in sigmas, beyond which a corner lies off: one of 1e5 sound ones does (chi-square of 3).
@@ -115,6 +116,21 @@ def outlying(problem: BoardProblem) -> Bool[Tensor, "*batch boards corners"]:
     return off
 
 
+def little_off(measured: BoardMeasurements, off: Bool[Tensor, "boards corners"]) -> Bool[Tensor, "boards corners"]:
+    """Corners, of those that are off boards, that lie no farther off than lines may be displaced by."""
+    problem = SoundProblem.of(measured, None).problem
+    boards = _Boards.of(problem, problem.valid.any(-1))
+    error = boards.fit((~off).to(problem.points)).error
+    known = torch.where(boards.valid[..., None], boards.points, torch.nan)
+    return off & (error.abs().amax(-1) < _little(known))
+
+
+def _little(known: Float[Tensor, "boards corners 3"]) -> Float[Tensor, "boards 1"]:
+    """What lines may be displaced by, mm, on boards whose corners, nan where not seen, these are."""
+    span = known.nan_to_num(nan=-torch.inf).amax(-2) - known.nan_to_num(nan=torch.inf).amin(-2)
+    return _LITTLE * span.amax(-1, keepdim=True)
+
+
 def _robust_outliers(boards: _Boards) -> Tensor:
     """Corners off their board, ``(boards, corners)``."""
     best = _concentrated(boards, _graduated(boards))
@@ -145,8 +161,7 @@ def _displaced_with_their_line(boards: _Boards, fit: AffineFit) -> Tensor:
     rest = error - shared
     squared = (rest * apply(boards.information, rest)).sum(-1)
     scale = (squared.nanmedian(dim=-1, keepdim=True).values / _MEDIAN).clamp(min=1.0)
-    span = known.nan_to_num(nan=-torch.inf).amax(-2) - known.nan_to_num(nan=torch.inf).amin(-2)
-    little = shared.abs().amax(-1) < _LITTLE * span.amax(-1, keepdim=True)
+    little = shared.abs().amax(-1) < _little(known)
     return (squared <= _LIMIT * scale) & (squared <= _SHARED * fit.squared) & little
 
 

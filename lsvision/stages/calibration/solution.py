@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from lsvision.estimation import Posterior
+from lsvision.estimation import Posterior, lower_factor
 from lsvision.stages.calibration.along_scan import Beforehand, ErrorsAlongScan, by_chance, errors_along_scan
 from lsvision.stages.calibration.board_scale import explained_by_size, with_unknown_size
 from lsvision.stages.calibration.chosen import merged, scattered
@@ -60,7 +60,7 @@ def estimate_with_noise(
         again = estimate_white(along.problem(problem), start[along.found], config)
         found = found.replaced(along.found, again)
     weighed = replace(problem, correlated=along.noise)
-    posterior = found.posterior
+    posterior = wider(found.posterior, along.factor_of_n)
     if not _drifts(weighed, config):
         posterior = with_unknown_size(weighed, posterior, found.noise_scale, config.board_scale_sigma)
     return NoisyEstimate(posterior, found.noise_scale, found.scatter, along)
@@ -82,6 +82,16 @@ def estimate_white(problem: BoardProblem, start: Float[Tensor, "*batch state"], 
         return found
     again = estimate(problem.scaled(scale).at(larger), start[larger], config)
     return found.replaced(larger, Estimate(again, scale[larger], apart[larger]))
+
+
+def wider(posterior: Posterior, factor_of_n: Float[Tensor, "*batch 3 3"]) -> Posterior:
+    """Posteriors whose covariance of n is larger by that of a factor."""
+    larger = factor_of_n.flatten(-2).any(-1)
+    if not bool(larger.any()):
+        return posterior
+    more = torch.nn.functional.pad(factor_of_n, (0, 0, posterior.factor.shape[-2] - 3, 0))
+    factor = lower_factor(torch.cat([posterior.factor, more], dim=-1))
+    return replace(posterior, factor=torch.where(larger[..., None, None], factor, posterior.factor))
 
 
 def _drifts(problem: BoardProblem, config: CalibrationConfig) -> bool:

@@ -72,7 +72,7 @@ class Solution:
         problem, scale = self.problem.at(place), self.noise_scale[place]
         linearised = Linearised.of(problem, self.posterior.mean[place], self.config.prior_sigma)
         return processes_given_corners(
-            problem.scaled(scale), linearised, self.along_scan.variances[place], reach, self.edges
+            problem.scaled(scale), linearised, self.along_scan.spectrum.at(place), reach, self.edges
         )
 
     def rmse_with_lines_as_they_are(self) -> Float[Tensor, "*batch"]:
@@ -128,13 +128,20 @@ class Solution:
         return squared
 
 
-def solve(measured: BoardMeasurements, config: CalibrationConfig) -> Solution:
-    """The problems estimated without outlying corners, and with the noise that the others' residuals ask for."""
+def solve(
+    measured: BoardMeasurements, config: CalibrationConfig, off: Bool[Tensor, "*batch boards corners"] | None = None
+) -> Solution:
+    """The problems estimated without outlying corners, and with the noise that the others' residuals ask for.
+
+    Args:
+        off: corners to leave out; those that are found to lie off if None.
+    """
     config = config.resolved()
     _check(config, measured.points.shape[-3])
     posed = SoundProblem.of(measured, _mounting_pitch(config))
     drifts = config.method == "sequential" and bool(config.process_sigma)  # no affine map fits where n walks
-    off = torch.zeros_like(posed.problem.valid) if drifts else outlying(posed.problem)
+    if off is None:
+        off = torch.zeros_like(posed.problem.valid) if drifts else outlying(posed.problem)
     if bool(off.any()):
         posed = SoundProblem.of(replace(measured, valid=measured.valid & ~off), _mounting_pitch(config))
     found = estimate_with_noise(posed.problem, posed.start, config)

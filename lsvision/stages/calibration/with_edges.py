@@ -27,9 +27,10 @@ from lsvision.stages.calibration.along_scan import (
 )
 from lsvision.stages.calibration.along_scan.kernels import wave_length
 from lsvision.stages.calibration.along_scan.lines import Travel
+from lsvision.stages.calibration.along_scan.windows import Windows
 from lsvision.stages.calibration.model import refitted, residuals_in_sigmas
 from lsvision.stages.calibration.problem import BoardProblem
-from lsvision.stages.calibration.solution import estimate_white
+from lsvision.stages.calibration.solution import estimate_white, wider
 from lsvision.stages.calibration.solved import Solution
 from lsvision.types import BoardEdges
 
@@ -66,7 +67,7 @@ def _estimated(solution: Solution, edges: EdgeRows) -> Solution:
     # About poses that leave the least residuals: those of the posterior are off by what long waves are.
     linearised = Linearised.of(problem, refitted(problem, solution.posterior.mean), config.prior_sigma)
     errors = search_with_edges(
-        problem, linearised, edges, None if solution.edges is None else solution.along_scan.variances
+        problem, linearised, edges, None if solution.edges is None else solution.along_scan.spectrum
     )
     noise = with_processes(problem, covariance_root(errors.covariance(FINE))[None], FINE, edges)
     estimate = estimate_white(replace(problem, correlated=noise), solution.start, config)
@@ -75,13 +76,14 @@ def _estimated(solution: Solution, edges: EdgeRows) -> Solution:
         unlike=solution.along_scan.unlike,
         rms_mm=errors.rms_mm,
         length_mm=wave_length(errors.covariance(SEARCHED)) * Travel.of(problem).extent_mm,
-        variances=errors.variances,
+        spectrum=errors.spectrum,
         log_ratio=errors.log_ratio,
+        factor_of_n=errors.factor_of_n,
         noise=noise,
     )
     return replace(
         solution,
-        posterior=estimate.posterior,
+        posterior=wider(estimate.posterior, errors.factor_of_n),
         scatter=estimate.scatter,
         along_scan=along,
         edges=edges,
@@ -89,20 +91,15 @@ def _estimated(solution: Solution, edges: EdgeRows) -> Solution:
 
 
 def _unbent(problem: BoardProblem, found: Solution) -> BoardProblem:
-    """A problem whose corners lie where they would if a vibration had not bent the edges in their windows.
-
-    A straight edge that is fitted over a window of 2 r lies off the middle of a bent one by r² / 6 of the second
-    derivative; r² / 6 is what the corners' residuals are of it.
-    """
-    processes = found.processes(())
-    bend = processes.bend().displaced(problem.points)
+    """A problem whose corners lie where they would if a vibration had not bent the edges in their windows."""
+    windows, travel = Windows.of(problem, found.posterior.mean), Travel.of(problem)
+    end = travel.start_mm + travel.extent_mm
+    reach = torch.stack([travel.start_mm - windows.spacing_mm / 2, end + windows.spacing_mm / 2], dim=-1)
+    processes = found.processes((), reach)
     moved = torch.where(problem.valid[..., None], processes.displaced(problem.points), 0.0)
     steadied = replace(problem, points=problem.points - moved)
-    left = residuals_in_sigmas(steadied, found.posterior.mean)
-    by_bend = torch.linalg.solve_triangular(problem.noise_chol, bend[..., None], upper=False)[..., 0]
-    by_bend = torch.where(problem.valid[..., None], by_bend, 0.0)
-    part = ((left * by_bend).sum() / by_bend.square().sum().clamp(min=1e-12)).clamp(min=0.0)
-    return replace(problem, points=problem.points - torch.where(problem.valid[..., None], part * bend, 0.0))
+    off = windows.off(processes, problem, residuals_in_sigmas(steadied, found.posterior.mean))
+    return replace(problem, points=problem.points - off)
 
 
 def _noise_scale(problem: BoardProblem, found: Solution) -> Tensor:

@@ -107,15 +107,19 @@ def _with_colors(
     rms = float(signal.total[signal.total_valid].std())
     fit = fit_shares(signal, rms, _USUAL_LENGTH_MM / (knots.size * pitch_mm))
     shape = replace(shape, separated_up_to_mm=separated_up_to_mm(signal, knots, rms, pitch_mm))
-    if not _is_there(fit, 1, signal, config):
-        return shape if fit.evidence[1] < _DOUBT else replace(shape, separated_up_to_mm=None)
-    if not _is_there(fit, 0, signal, config):
+    there = _is_there(fit, 1, signal, config)
+    if there and not _is_there(fit, 0, signal, config):
         return replace(shape, is_all=True)
+    if not there and fit.evidence[1] < _DOUBT and not fit.neighbours:
+        return shape
     mean, variance = (
         knots.at_lines(part, len(shape.mean))
         for part in smooth_shares(fit.model, signal, block=_BLOCK_KNOTS, halo=_HALO_KNOTS)
     )
-    return replace(shape, mean=shape.mean + mean, variance=variance.clamp(min=0))
+    variance = variance.clamp(min=0)
+    if not there:  # in doubt: what may be shape is taken for motion, and its sigma says so
+        return replace(shape, separated_up_to_mm=None, variance=mean.square() + variance)
+    return replace(shape, mean=shape.mean + mean, variance=variance)
 
 
 def _is_there(fit: SharedFit, which: int, signal: SharedSignal, config: LineMotionConfig) -> bool:
@@ -153,10 +157,8 @@ def _finding_with(finding: LineFinding, values: Tensor, shape: Tensor, of: _Shap
     finding = replace(finding, separated_up_to_mm=of.separated_up_to_mm)
     if of.is_all or _rms(values) <= finding.sigma:
         return replace(finding, state="absent", rms=0.0, length_mm=None, shape_rms=finding.rms)
-    if not bool(shape.any()):
-        return finding
-    sigma = math.hypot(finding.sigma, float(of.variance.mean().sqrt()))
-    return replace(finding, rms=_rms(values), sigma=sigma, shape_rms=_rms(shape))
+    finding = replace(finding, sigma=math.hypot(finding.sigma, float(of.variance.mean().sqrt())))
+    return replace(finding, rms=_rms(values), shape_rms=_rms(shape)) if bool(shape.any()) else finding
 
 
 def _rms(values: Tensor) -> float:

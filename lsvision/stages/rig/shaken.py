@@ -20,7 +20,7 @@ from torch import Tensor
 from lsvision.estimation import jacobian
 from lsvision.estimation.gaussian_process import covariance_root
 from lsvision.geometry import RawPair
-from lsvision.stages.calibration.along_scan import COMPONENTS, FINE, Travel, covariance_of, latents
+from lsvision.stages.calibration.along_scan import COMPONENTS, FINE, Travel, latents
 from lsvision.stages.calibration.batch import errors_along_scan_of
 from lsvision.stages.calibration.config import CalibrationConfig
 from lsvision.stages.calibration.measurements import BoardMeasurements
@@ -100,7 +100,7 @@ def _measured(solution: RigSolution) -> BoardMeasurements:
 
 def _along(solution: RigSolution, by_points: Solution) -> Float[Tensor, "boards rows rows"]:
     """Factor of the covariance of each board's residuals, in sigmas."""
-    roots = covariance_root(covariance_of(by_points.along_scan.variances, FINE))[None]
+    roots = covariance_root(by_points.along_scan.spectrum.covariance(FINE))[None]
     rows = torch.cat(
         [
             _by_latents(solution, by_points, eye, by_place, roots)

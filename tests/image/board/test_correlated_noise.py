@@ -38,7 +38,9 @@ def dense(first: Residuals, second: Residuals, fit: int) -> Tensor:
     box = (1 - du.abs()).clamp(min=0) * (1 - dv.abs()).clamp(min=0)
     wide = [torch.exp(-0.5 * (du.square() + dv.square()) / s**2) for s in (1.0, 2.0, 4.0)]
     edges = first.steepness[fit][:, None] * box * second.steepness[fit]
-    return torch.stack([box, *wide, edges])
+    same_line = (1 - dv.abs()).clamp(min=0)
+    shifts = [first.jacobian[fit, axis][:, None] * same_line * second.jacobian[fit, axis] for axis in (0, 1)]
+    return torch.stack([box, *wide, *shifts, edges])
 
 
 def left_over(fits: Residuals, fit: int) -> Tensor:
@@ -50,7 +52,7 @@ def test_products_equal_those_of_dense_matrices():
     first, second = random_residuals(), random_residuals()
     correlation = Correlation.between(first, second, torch.float64)
     applied = correlation.times(second.influence)
-    expected = torch.zeros(5, 5).double()
+    expected = torch.zeros(7, 7).double()
     for fit in range(3):
         kinds = dense(first, second, fit)
         torch.testing.assert_close(applied[:, fit].mT, kinds @ second.influence[fit].mT, rtol=0, atol=1e-12)
@@ -118,6 +120,20 @@ def test_chi_square_of_the_difference_and_the_mean_of_two_images(texture, width)
         assert shared.diagonal(dim1=-2, dim2=-1).mean().abs() < 0.1 * white
 
 
+@pytest.mark.parametrize(("sideways", "along"), [(0.05, 0.0), (0.4, 0.0), (0.0, 0.3)])
+@pytest.mark.parametrize("angle", [0.05, 0.3])
+def test_chi_square_where_each_line_is_shifted(sideways, along, angle):
+    angles = torch.tensor([angle, angle + 1.6]).double().expand(200, 2)
+    shift = torch.tensor([sideways, along]) * torch.randn(200, 17, 2, dtype=torch.float64)
+    clean = saddle_windows(torch.zeros(200, 2).double(), angles, torch.full((200,), 0.8).double(), line_shift=shift)
+    fit = fit_saddles(clean + 2 * torch.randn_like(clean), angles)
+    noise = BoardNoise.of(fit.residuals, torch.ones(200, dtype=torch.bool))
+    squared = (fit.position * torch.linalg.solve(noise.covariance(fit.valid), fit.position[..., None])[..., 0]).sum(-1)
+    assert 1.6 < squared.mean() < 2.4
+    expected = torch.tensor([sideways, along]).double().square()  # of small shifts; the blur takes a part of large ones
+    torch.testing.assert_close(noise.strength[4:6], expected, rtol=0.3, atol=1e-3)
+
+
 def test_windows_of_different_size_are_compared_in_their_middle():
     left, right = (fit.residuals for fit in noisy_fits(20, 17, 3.0, 3.0, 1.5))
     smaller = left.cropped(13)
@@ -131,8 +147,10 @@ def test_windows_of_different_size_are_compared_in_their_middle():
 def test_what_images_share_is_at_most_what_either_has_and_no_error_of_edges():
     left, _ = noisy_fits(20, 17, 3.0, 3.0, 1.5)
     every = torch.ones(20, dtype=torch.bool)
-    noise = BoardNoise(left.residuals, torch.tensor([1.0, 0.5, 0.0, 0.0, 40.0]).double())
-    faint = BoardNoise(left.residuals, torch.tensor([0.25, 2.0, 0.0, 0.0, 40.0]).double())
-    allowed = corner_covariance(left.residuals, left.residuals, torch.tensor([0.5, 1.0, 0.0, 0.0, 0.0]).double())
+    noise = BoardNoise(left.residuals, torch.tensor([1.0, 0.5, 0.0, 0.0, 0.0, 0.0, 40.0]).double())
+    faint = BoardNoise(left.residuals, torch.tensor([0.25, 2.0, 0.0, 0.0, 0.0, 0.0, 40.0]).double())
+    allowed = corner_covariance(
+        left.residuals, left.residuals, torch.tensor([0.5, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0]).double()
+    )
     shared = noise.covariance_with(faint, every)
     assert (torch.linalg.eigvalsh(allowed - shared) > -1e-12).all()

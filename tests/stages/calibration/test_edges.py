@@ -8,10 +8,7 @@ import torch
 from torch.nn.functional import pad
 
 from lsvision.geometry import middle_point, scan_position, shaken, transform, without_trend
-from lsvision.stages.calibration.along_scan import Linearised, edge_rows, search_with_edges
-from lsvision.stages.calibration.along_scan.evidence import NormalEquations
-from lsvision.stages.calibration.along_scan.kernels import FINE, covariance_of, kernel_family
-from lsvision.stages.calibration.along_scan.search import evidence_by_component
+from lsvision.stages.calibration.along_scan import edge_rows
 from lsvision.stages.calibration.calibrate import calibrate
 from lsvision.stages.calibration.config import CalibrationConfig
 from lsvision.stages.calibration.problem import BoardProblem, BoardState
@@ -127,24 +124,6 @@ def test_errors_that_last_along_an_edge_weigh_less():
     rows = edge_rows(problem, state, [dataclasses.replace(edges[0], points=moved), edges[1]])
     lost = rows.rows.square().sum((-2, -1))
     assert 0.1 < float(lost[0] / lost[1]) < 0.8
-
-
-def test_no_step_of_the_search_lowers_the_likelihood(monkeypatch):
-    corners, motion = shaken_boards(4, TWO_TILTS)
-    problem, state = at_truth(corners)
-    edges = edge_rows(problem, state, edges_of(corners, motion))
-    linearised = Linearised.of(problem, state, prior_sigma=0.05)
-    before = -math.inf
-    for steps in (1, 3, 6, 12, 20):
-        monkeypatch.setattr("lsvision.stages.calibration.along_scan.all_kernels._STEPS", steps)
-        found = search_with_edges(problem, linearised, edges)
-        assert found.log_evidence > before
-        before = found.log_evidence
-    equations = NormalEquations.of(problem, linearised, FINE, edges)
-    one = torch.zeros(4, len(kernel_family(FINE).log_prior), dtype=torch.float64)
-    one[0, 4] = one[2, 4] = one[3, 4] = 0.09  # a broad band instead
-    other, _ = evidence_by_component(equations, covariance_of(one, FINE)[None])
-    assert found.log_evidence > float(other) + 100
 
 
 @pytest.mark.slow

@@ -9,7 +9,7 @@ from torch.nn.functional import pad
 
 from lsvision.estimation.gaussian_process import covariance_root
 from lsvision.geometry import middle_point, shaken, steadied, without_trend
-from lsvision.stages.calibration.along_scan import Linearised, processes_given_corners
+from lsvision.stages.calibration.along_scan import Linearised, Spectrum, processes_given_corners
 from lsvision.stages.calibration.along_scan.kernels import FINE, covariance_of, kernel_family
 from lsvision.stages.calibration.along_scan.lines import Travel, directions, latents
 from lsvision.stages.calibration.calibrate import calibrate
@@ -75,7 +75,7 @@ def test_processes_are_those_of_a_dense_gaussian_regression():
     linearised = Linearised.of(problem, state, prior_sigma=0.05)
     variances = torch.zeros(4, len(kernel_family().log_prior), dtype=torch.float64)
     variances[0, 3], variances[2, 13], variances[3, 4] = 0.01, 0.02, 0.005
-    found = processes_given_corners(problem, linearised, variances)
+    found = processes_given_corners(problem, linearised, Spectrum.of_kernels(variances))
 
     roots = covariance_root(covariance_of(variances, FINE))
     moved = latents(problem, roots[None], FINE)
@@ -115,7 +115,7 @@ def test_corners_are_displaced_as_their_lines_are():
     problem, start = small_problem()
     linearised = Linearised.of(problem, start, prior_sigma=0.05)
     variances = torch.full((4, len(kernel_family().log_prior)), 1e-4, dtype=torch.float64)
-    found = processes_given_corners(problem, linearised, variances)
+    found = processes_given_corners(problem, linearised, Spectrum.of_kernels(variances))
     weights = Travel.of(problem).weights(problem, FINE)
     expected = ((weights @ found.mean.mT)[..., None] * directions(problem)).sum(-2)
     seen = problem.valid

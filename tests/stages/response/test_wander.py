@@ -1,5 +1,6 @@
 """Gains of columns by the sideways wander of objects."""
 
+import functools
 import math
 
 import pytest
@@ -14,6 +15,7 @@ from lsvision.stages.response.wander import WanderGains, WanderSums, _Means, _wi
 WIDTH = 300
 
 
+@functools.cache
 def wandering(rms: float, lines: int = 6000, seed: int = 0) -> tuple[WanderGains, Tensor]:
     """What lines show of an object with streaks and edges that wanders by ``rms`` px, and the true gains."""
     chance = torch.Generator().manual_seed(seed)

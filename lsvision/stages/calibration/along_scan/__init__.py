@@ -9,10 +9,11 @@ from lsvision.stages.calibration.along_scan.check import SUSPICION, by_chance
 from lsvision.stages.calibration.along_scan.edges import EdgeRows, edge_rows
 from lsvision.stages.calibration.along_scan.errors import ErrorsAlongScan, errors_along_scan, with_processes
 from lsvision.stages.calibration.along_scan.evidence import Linearised
-from lsvision.stages.calibration.along_scan.kernels import FINE, SEARCHED, covariance_of
+from lsvision.stages.calibration.along_scan.kernels import FINE, SEARCHED
 from lsvision.stages.calibration.along_scan.lines import COMPONENTS, Travel, latents
 from lsvision.stages.calibration.along_scan.posterior import Processes, processes_given_corners
 from lsvision.stages.calibration.along_scan.search import Beforehand, FoundErrors, search
+from lsvision.stages.calibration.along_scan.spectrum import Spectrum
 
 __all__ = [
     "COMPONENTS",
@@ -25,9 +26,9 @@ __all__ = [
     "FoundErrors",
     "Linearised",
     "Processes",
+    "Spectrum",
     "Travel",
     "by_chance",
-    "covariance_of",
     "edge_rows",
     "errors_along_scan",
     "latents",

@@ -13,6 +13,7 @@ from lsvision.stages.calibration.along_scan.evidence import Linearised
 from lsvision.stages.calibration.along_scan.kernels import FINE, SEARCHED, Knots, kernel_family, wave_length
 from lsvision.stages.calibration.along_scan.lines import COMPONENTS, Travel, latents
 from lsvision.stages.calibration.along_scan.search import Beforehand, FoundErrors, search
+from lsvision.stages.calibration.along_scan.spectrum import Spectrum
 from lsvision.stages.calibration.problem import BoardProblem
 from lsvision.stages.calibration.reduction import CorrelatedNoise, affine_features, rows_with_latents
 
@@ -25,17 +26,19 @@ class ErrorsAlongScan:
     """The errors along the scans of a batch of problems, zero where none were ``found``.
 
     Those that are ``unlike`` any process that was tried have sigmas that need not cover what they do to n. ``rms_mm``
-    and ``length_mm`` are those of each component: the length of a wave as correlated. ``variances``, mm², are those of
-    its kernels, ``log_ratio`` how much more probable the corners are with it than without. ``noise`` is the corners'
-    noise with these errors, None where none were found in any problem, as given where they were in others.
+    and ``length_mm`` are those of each component: the length of a wave as correlated. ``spectrum`` is what it is made
+    of, ``log_ratio`` how much more probable the corners are with it than without. ``factor_of_n`` is that of the
+    covariance that n owes to the spectrum. ``noise`` is the corners' noise with these errors, None where none were
+    found in any problem, as given where they were in others.
     """
 
     found: Bool[Tensor, "*batch"]
     unlike: Bool[Tensor, "*batch"]
     rms_mm: Float[Tensor, "*batch 4"]
     length_mm: Float[Tensor, "*batch 4"]
-    variances: Float[Tensor, "*batch 4 kernels"]
+    spectrum: Spectrum
     log_ratio: Float[Tensor, "*batch 4"]
+    factor_of_n: Float[Tensor, "*batch 3 3"]
     noise: CorrelatedNoise | None
 
     def problem(self, problem: BoardProblem) -> BoardProblem:
@@ -61,11 +64,12 @@ def errors_along_scan(
         prior_sigma: of each component of n.
     """
     rms, length, log_ratio = (state.new_zeros(*state.shape[:-1], len(COMPONENTS)) for _ in range(3))
-    variances = state.new_zeros(*rms.shape, len(kernel_family().log_prior))
+    spectrum = _no_spectrum(rms)
+    factor_of_n = state.new_zeros(*state.shape[:-1], 3, 3)
     doubtful = probability < SUSPICION
     found, unlike = doubtful.clone(), torch.zeros_like(doubtful)
     if not bool(found.any()):
-        return ErrorsAlongScan(found, unlike, rms, length, variances, log_ratio, None)
+        return ErrorsAlongScan(found, unlike, rms, length, spectrum, log_ratio, factor_of_n, None)
     rows, log_det = problem.affine_rows.clone(), problem.noise_log_det.clone()
     for index in doubtful.nonzero():
         place = tuple(index.tolist())
@@ -76,7 +80,9 @@ def errors_along_scan(
             found[place] = False
             unlike[place] = (probability[place] < _BEYOND_DOUBT) & (known.process_sigma == 0)
             continue
-        rms[place], variances[place], log_ratio[place] = errors.rms_mm, errors.variances, errors.log_ratio
+        rms[place], log_ratio[place] = errors.rms_mm, errors.log_ratio
+        factor_of_n[place] = errors.factor_of_n
+        spectrum.set(place, errors.spectrum)
         travel = Travel.of(one)
         length[place] = wave_length(errors.covariance(SEARCHED)) * travel.extent_mm
         searched, fine = (covariance_root(_covariance(errors, travel, known, knots)) for knots in (SEARCHED, FINE))
@@ -84,7 +90,13 @@ def errors_along_scan(
         noise = with_processes(one, fine)
         rows[place], log_det[place] = noise.rows, noise.log_det
     with_errors = CorrelatedNoise(rows, log_det) if bool(found.any()) else None
-    return ErrorsAlongScan(found, unlike, rms, length, variances, log_ratio, with_errors)
+    return ErrorsAlongScan(found, unlike, rms, length, spectrum, log_ratio, factor_of_n, with_errors)
+
+
+def _no_spectrum(rms: Float[Tensor, "*batch 4"]) -> Spectrum:
+    """That of a batch of problems without errors along the scan."""
+    variances = rms.new_zeros(*rms.shape, len(kernel_family(FINE).log_prior))
+    return Spectrum.of_kernels(variances).padded()
 
 
 def _covariance(errors: FoundErrors, travel: Travel, known: Beforehand, knots: Knots) -> Tensor:

@@ -6,7 +6,7 @@ Errors that are longer than four of them are a motion n to every observer, and b
 
 import math
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, lru_cache
 
 import torch
 from jaxtyping import Float
@@ -33,6 +33,9 @@ _SHORT_FREQUENCIES = tuple(0.25 * k for k in range(17, 33))  # which only finer 
 _LASTING_FREQUENCIES = tuple(0.25 * 2.0 ** (k / 6) for k in range(25))
 _FADING, _LASTING = 2.0, 8.0  # coherence of waves: how far one keeps its phase
 _FADING_RANK, _LASTING_RANK = 16, 8  # of their covariances, the rest of which is rounding
+BROAD = len(_ROUGH_LENGTHS) + len(_SMOOTH_LENGTHS)
+"""Number of broad-band kernels, which come first."""
+_TABLES = 4  # of correlations that are kept: knots reach as far as each problem's scans
 # Amplitudes, in units of the residuals' rms: prior log-uniform between them.
 AMPLITUDES = tuple(2.0**k for k in range(-5, 5))
 
@@ -112,8 +115,23 @@ def kernel_family(knots: Knots = SEARCHED) -> KernelFamily:
 
 def covariance_of(variances: Float[Tensor, "*batch kernels"], knots: Knots) -> Float[Tensor, "*batch knots knots"]:
     """Covariance at knots of a sum of processes of all kernels, each of some variance, mm²."""
-    correlation = torch.cat(_correlations(knots)).to(variances)
+    correlation = _all_correlations(knots).to(variances)
     return torch.tensordot(variances, correlation[: variances.shape[-1]], 1)
+
+
+def narrow_frequencies(
+    variances: Float[Tensor, "*batch kernels"],
+) -> tuple[Float[Tensor, " narrow"], Float[Tensor, "*batch narrow"]]:
+    """Frequencies of the narrow-band kernels, waves per unit, and their variances."""
+    frequency = variances.new_tensor((*_FADING_FREQUENCIES, *_LASTING_FREQUENCIES, *_SHORT_FREQUENCIES))
+    narrow = variances[..., BROAD:]
+    return frequency[: narrow.shape[-1]], narrow
+
+
+@lru_cache(maxsize=_TABLES)
+def _all_correlations(knots: Knots) -> Float[Tensor, "kernels knots knots"]:
+    """All kernels between knots, one after the other."""
+    return torch.cat(_correlations(knots))
 
 
 def _correlations(knots: Knots) -> list[Float[Tensor, "_ knots knots"]]:

@@ -16,8 +16,9 @@ from lsvision.estimation import solve_upper, upper_root
 from lsvision.estimation.gaussian_process import covariance_root
 from lsvision.stages.calibration.along_scan.edges import EdgeRows
 from lsvision.stages.calibration.along_scan.evidence import Linearised
-from lsvision.stages.calibration.along_scan.kernels import FINE, Knots, covariance_of
+from lsvision.stages.calibration.along_scan.kernels import FINE, Knots
 from lsvision.stages.calibration.along_scan.lines import COMPONENTS, Lever, Travel, latents
+from lsvision.stages.calibration.along_scan.spectrum import Spectrum
 from lsvision.stages.calibration.problem import BoardProblem
 
 _POSE = 6
@@ -56,7 +57,7 @@ class Processes:
 def processes_given_corners(
     problem: BoardProblem,
     linearised: Linearised,
-    variances: Float[Tensor, "4 kernels"],
+    spectrum: Spectrum,
     reach: Float[Tensor, "boards 2"] | None = None,
     edges: EdgeRows | None = None,
 ) -> Processes:
@@ -65,13 +66,13 @@ def processes_given_corners(
     Args:
         problem: of batch shape (), its white noise scaled as the residuals ask for.
         linearised: about the solution.
-        variances: of the kernels of each component, mm².
+        spectrum: of the errors.
         reach: least and greatest travel, mm, of each scan; that of the corners if None.
         edges: of the boards.
     """
     travel = Travel.of(problem)
     knots = FINE if reach is None else _knots(travel, reach)
-    roots = covariance_root(covariance_of(variances, knots))
+    roots = covariance_root(spectrum.covariance(knots))
     by_latents = latents(problem, roots[None], knots)
     columns = torch.cat([by_latents, linearised.columns], dim=-1)
     white = torch.linalg.solve_triangular(problem.noise_chol, columns, upper=False)

@@ -24,10 +24,10 @@ from lsvision.stages.calibration.along_scan.kernels import (
     SEARCHED,
     KernelFamily,
     Knots,
-    covariance_of,
     kernel_family,
 )
 from lsvision.stages.calibration.along_scan.lines import COMPONENTS, Travel
+from lsvision.stages.calibration.along_scan.spectrum import Spectrum
 from lsvision.stages.calibration.problem import BoardProblem
 
 _COUNT = len(COMPONENTS)
@@ -55,23 +55,24 @@ class Beforehand:
 
 @dataclass(frozen=True)
 class FoundErrors:
-    """Variances, mm², of the kernels that the errors of each component are made of, and the log evidence for them.
+    """The spectrum of the errors of each component, and the log evidence for them.
 
     ``rms_mm`` of each component is the most probable one, and little more than the residuals show: a covariance that is
     a mean over amplitudes is larger, above all that of waves of which most is taken for poses and n.
-    ``log_ratio`` is how much more probable the corners are with the errors
-    of each component than without. The constant that is missing in the evidence is the same for all linearisations of a
-    problem.
+    ``log_ratio`` is how much more probable the corners are with the errors of each component than without.
+    ``factor_of_n`` is that of what n's covariance owes to the spectrum, which is known no better than the data show it.
+    The constant that is missing in the evidence is the same for all linearisations of a problem.
     """
 
-    variances: Float[Tensor, "4 kernels"]
+    spectrum: Spectrum
     log_ratio: Float[Tensor, "4"]
     rms_mm: Float[Tensor, "4"]
     log_evidence: float
+    factor_of_n: Float[Tensor, "3 3"]
 
     def covariance(self, knots: Knots) -> Float[Tensor, "4 knots knots"]:
         """Covariance of the errors of each component at knots, mm²."""
-        return covariance_of(self.variances, knots)
+        return self.spectrum.covariance(knots)
 
 
 def search(problem: BoardProblem, linearised: Linearised, known: Beforehand) -> FoundErrors | None:
@@ -130,7 +131,8 @@ class _Search:
                         self._weigh(component, layer, self.family.log_prior)
         evidence, log_ratio = evidence_by_component(self.equations, self.covariances.sum(1) + self.walk)
         rms = torch.minimum(self.rms_mm.square().sum(-1).sqrt(), _SHOWN * self.equations.rms_mm)
-        return FoundErrors(self.variances.sum(1), log_ratio, rms, float(evidence))
+        spectrum = Spectrum.of_kernels(self.variances.sum(1))
+        return FoundErrors(spectrum, log_ratio, rms, float(evidence), rms.new_zeros(3, 3))
 
     def _weigh_first(self, component: int) -> "_Weighed":
         """Weigh the first process of a component."""
@@ -173,6 +175,11 @@ class _Search:
         others = [self.by_kernel[other] for other in range(_COUNT) if other != component]
         ratio = sum((other - torch.logsumexp(other + prior, 0) for other in others), torch.zeros_like(prior))
         return prior + torch.logaddexp(ratio + math.log(_SHARED), prior.new_tensor(math.log(1.0 - _SHARED)))
+
+
+def evidence_of(equations: NormalEquations, covariance: Float[Tensor, "4 knots knots"]) -> float:
+    """The log evidence for errors of some covariance, mm²."""
+    return float(equations.log_evidence(*_present(covariance[None])))
 
 
 def evidence_by_component(
