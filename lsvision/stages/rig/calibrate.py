@@ -16,6 +16,7 @@ from lsvision.geometry import (
 )
 from lsvision.stages.rig.advice import next_scan
 from lsvision.stages.rig.config import RigConfig
+from lsvision.stages.rig.data_sheet import contradicted
 from lsvision.stages.rig.height_shape import HeightShape
 from lsvision.stages.rig.held_out import FEWEST_BOARDS, HeldOut
 from lsvision.stages.rig.model import QUANTITIES, RigPrior
@@ -59,7 +60,8 @@ def calibrate_rig(sightings: Sightings, scans: Sequence[str], rig: RawRig, confi
     shape = HeightShape.of(rig, shared, prior.sigma, depth_range_mm)
     weak = unobserved(solution, shape, config)
     advice = next_scan(solution, shape, depth_range_mm).in_words
-    reasons = [*_faults(solution), *contradicting]
+    wrong_sheet = None if shaken.errors or contradicting else contradicted(solution, config)
+    reasons = [*_faults(solution), *contradicting, *([wrong_sheet] if wrong_sheet else [])]
     bending = [combination for combination in weak if combination.bend_um >= config.least_height_um]
     if bending and not reasons:
         reasons = [*_left_to_the_data_sheet(bending), advice]
@@ -75,7 +77,7 @@ def calibrate_rig(sightings: Sightings, scans: Sequence[str], rig: RawRig, confi
         height_error_um=1e3 * float(shape.stated_mm(solution.factor)),
         unobserved=weak,
         advice=advice,
-        verdict=_verdict(solution, bool(bending)),
+        verdict=_verdict(solution, bool(bending), wrong_sheet is not None),
         reasons=tuple(reasons),
         errors_along_scan=shaken.errors,
     )
@@ -102,10 +104,10 @@ def _about_own_depth(covariance: Tensor, start: RawRig, found: RawRig) -> Tensor
     return (both + both.mT) / 2
 
 
-def _verdict(solution: RigSolution, bending: bool) -> RigVerdict:
+def _verdict(solution: RigSolution, bending: bool, wrong_sheet: bool) -> RigVerdict:
     if not bool(solution.found.converged):
         return "not converged"
-    if float(solution.noise_scale) > _LARGEST_NOISE:
+    if float(solution.noise_scale) > _LARGEST_NOISE or wrong_sheet:
         return "inconsistent"
     return "prior-dominated" if bending else "determined"
 

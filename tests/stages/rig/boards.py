@@ -57,7 +57,7 @@ def restated(sightings: Sightings, ratio: float) -> Sightings:
     return replace(sightings, left=eyes[0], right=eyes[1])
 
 
-def first_of(sightings: Sightings) -> Sightings:
-    """The first problem of a batch."""
-    eyes = [CameraSighting(eye.position[0], eye.factor[0]) for eye in (sightings.left, sightings.right)]
-    return Sightings(eyes[0], eyes[1], sightings.valid[0], sightings.board_points)
+def first_of(sightings: Sightings, index: int = 0) -> Sightings:
+    """The first problem of a batch, or another one."""
+    eyes = [CameraSighting(eye.position[index], eye.factor[index]) for eye in (sightings.left, sightings.right)]
+    return Sightings(eyes[0], eyes[1], sightings.valid[index], sightings.board_points)

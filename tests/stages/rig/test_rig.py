@@ -9,11 +9,12 @@ import torch
 
 from lsvision.geometry import RawPair, quantities_of
 from lsvision.stages.rig.calibrate import calibrate_rig
+from lsvision.stages.rig.data_sheet import contradicted
 from lsvision.stages.rig.height_shape import HeightShape
 from lsvision.stages.rig.model import QUANTITIES, RigPrior, Shared
 from lsvision.stages.rig.sightings import CameraSighting, joined, sighted
 from lsvision.stages.rig.solve import solve_rig
-from lsvision.types import Board, Travel
+from lsvision.types import RIG_QUANTITIES, Board, Travel
 from tests.stages.rig.boards import CONFIG, DATA_SHEET, PRIOR, Truth, first_of, restated
 
 
@@ -174,3 +175,24 @@ def test_a_rig_that_is_off_in_k2_alone(k2):
     assert float((off / found.covariance.diagonal().sqrt()).abs().max()) < 3.5
     assert dict(found.rig.sigma)["left.distortion.1"] < 0.005
     assert 1e3 * float(shape_at(truth).bend_mm(off / PRIOR.sigma)) < min(10.0, 2.5 * found.height_error_um)
+
+
+@pytest.mark.parametrize("name", ["left.distortion.1", "right.turn_deg"])
+def test_a_data_sheet_that_is_sure_of_what_is_not_so(name):
+    """Heights would be off by several times what is stated."""
+    off = {"left.distortion.1": 0.05, "right.turn_deg": 0.2}[name]
+    quantities = quantities_of(DATA_SHEET)
+    quantities[RIG_QUANTITIES.index(name)] += off
+    truth = Truth(quantities[None], torch.tensor([[0.0, 1.0, 0.0]], dtype=torch.float64))
+    sightings = first_of(truth.scanned(8))
+    sure = replace(DATA_SHEET, sigma=((name, 0.0),))
+    found = calibrate_rig(sightings, list("abcdefgh"), sure, replace(CONFIG, held_out=False))
+    assert found.verdict == "inconsistent"
+    assert f"it says {name} " in found.reasons[-1]
+    assert "exactly" in found.reasons[-1]
+
+
+def test_sound_data_sheets_are_not_contradicted():
+    sightings = Truth.drawn(2).scanned(6)
+    for rig in range(2):
+        assert contradicted(solve_rig(first_of(sightings, rig), PRIOR, CONFIG), CONFIG) is None
