@@ -109,3 +109,11 @@ def test_corners_that_were_not_seen_are_nowhere_off(valid):
     assert Windows.of(problem, state).spacing_mm == pytest.approx(30.0)
     off = Windows.of(problem, state).off(processes, problem, _far(problem, state, processes))
     assert bool(off[0, 3].any()) is valid
+
+
+def test_the_spacing_is_that_of_neighbours_wherever_the_board_is_counted_from():
+    """A matrix of distances has rounding errors on its diagonal."""
+    problem, state, _ = setting()
+    for shift in (0.0, 17.3, 211.7):
+        counted = dataclasses.replace(problem, body_points=problem.body_points + shift)
+        assert Windows.of(counted, state).spacing_mm == pytest.approx(30.0)

@@ -47,7 +47,8 @@ class Windows:
         edges = edges / torch.linalg.vector_norm(edges, dim=-1, keepdim=True)
         normal = torch.stack([edges[..., 1], -edges[..., 0]], dim=-1)
         apart = torch.cdist(problem.body_points, problem.body_points)
-        apart[~(problem.valid[:, :, None] & problem.valid[:, None]) | (apart == 0.0)] = torch.inf
+        itself = torch.eye(apart.shape[-1], dtype=torch.bool)  # a distance that rounding makes nearly nothing
+        apart[~(problem.valid[:, :, None] & problem.valid[:, None]) | itself] = torch.inf
         return cls(
             normal=normal,
             reach=edges[..., 1].abs() / edges.abs().amax(-1),
