@@ -21,6 +21,7 @@ from lsvision.image.board.residuals import Residuals
 _SCALES_PX = (1.0, 2.0, 4.0)  # of the correlations of neighbouring pixels
 _SHIFTS = slice(1 + len(_SCALES_PX), 3 + len(_SCALES_PX))  # the kinds that shift lines, sideways and along the scan
 _BEYOND_CHANCE = 4.0  # standard deviations
+_SMOOTH = 0.5  # correlation of neighbouring lines from which a motion shifts them that is no noise
 _LEAST_SHARE = 0.2  # of the corners' variance: what the other kinds leave unexplained is like small shifts of lines
 _LARGEST_CORRELATION = 0.999
 _TRACED = 12  # windows of a board from which the expectation is taken: they are much alike
@@ -142,6 +143,7 @@ def noise_strength(first: Residuals, second: Residuals) -> Float[Tensor, " kinds
     expected = expected_products(some, others, correlation.of(every)).to(first.residual)
     expected *= len(left) / len(left[every])
     used = _beyond_chance(expected, found)
+    used[_SHIFTS] &= _likeness_of_neighbours(first) < _SMOOTH
     strength = _strength_of(used, expected, found)
     if bool(used[_SHIFTS].any()) and _share_of_shifts(some, strength) < _LEAST_SHARE:
         used[_SHIFTS] = False
@@ -164,6 +166,15 @@ def _beyond_chance(
     used = inverse @ found.sum(1) > _BEYOND_CHANCE * chance
     used[: _SHIFTS.start] = used[_SHIFTS.stop :] = True
     return used
+
+
+def _likeness_of_neighbours(fits: Residuals) -> Float[Tensor, "2"]:
+    """Correlation of what neighbouring lines are shifted by, sideways and along the scan."""
+    by_pixel = fits.jacobian[:, :2] * fits.residual[:, None]
+    shift = by_pixel.unflatten(-1, (fits.size, fits.size)).sum(-1)
+    before, after = shift[..., :-1], shift[..., 1:]
+    both = (before.square().sum((0, 2)) * after.square().sum((0, 2))).sqrt()
+    return (before * after).sum((0, 2)) / both.clamp(min=torch.finfo(both.dtype).tiny)
 
 
 def _share_of_shifts(fits: Residuals, strength: Float[Tensor, " kinds"]) -> float:

@@ -134,6 +134,19 @@ def test_chi_square_where_each_line_is_shifted(sideways, along, angle):
     torch.testing.assert_close(noise.strength[4:6], expected, rtol=0.3, atol=1e-3)
 
 
+def test_a_smooth_motion_of_lines_is_no_noise():
+    """A quarter of a pixel at the ends of the window, of a vibration of some 90 lines: calibrations find it."""
+    angles = torch.tensor([0.1, 1.7]).double().expand(200, 2)
+    phase = 2 * math.pi * torch.rand(200, 1, dtype=torch.float64)
+    wave = torch.sin(2 * math.pi / 90 * torch.arange(17) + phase)
+    shift = torch.stack([1.5 * wave, 0 * wave], -1)
+    shift = shift - shift[:, 8:9]
+    clean = saddle_windows(torch.zeros(200, 2).double(), angles, torch.full((200,), 0.8).double(), line_shift=shift)
+    fit = fit_saddles(clean + 2 * torch.randn_like(clean), angles)
+    noise = BoardNoise.of(fit.residuals, torch.ones(200, dtype=torch.bool))
+    assert noise.strength[4:6].tolist() == [0.0, 0.0]
+
+
 def test_windows_of_different_size_are_compared_in_their_middle():
     left, right = (fit.residuals for fit in noisy_fits(20, 17, 3.0, 3.0, 1.5))
     smaller = left.cropped(13)
