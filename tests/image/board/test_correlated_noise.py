@@ -8,12 +8,12 @@ from torch import Tensor
 
 from lsvision.image.board.correlated_noise import (
     BoardNoise,
-    Correlation,
     corner_covariance,
     expected_products,
     nonnegative_solution,
     possible_covariance,
 )
+from lsvision.image.board.noise_kinds import Correlation
 from lsvision.image.board.residuals import Residuals
 from lsvision.image.board.saddle import fit_saddles
 from tests.image.board.conftest import saddle_windows
