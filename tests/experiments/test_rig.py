@@ -92,6 +92,7 @@ def test_a_missing_data_sheet_is_one_line(command, scans, capsys):
     assert capsys.readouterr().err == "error: nowhere.yaml: no such file\n"
 
 
+@pytest.mark.slow
 def test_a_study_of_rigs(command, tmp_path):
     board = ("board.columns=7", "board.rows=5", "board.square_mm=52")
     assert command("+experiment=study_rig", "runs=3", "axes.boards=[2,4]", "axes.sideways=null", *board) == 0

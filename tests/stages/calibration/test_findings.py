@@ -75,7 +75,7 @@ def batch(corners, **options):
     )
 
 
-@pytest.mark.parametrize("method", ["joint", "least_squares"])
+@pytest.mark.parametrize("method", [pytest.param("joint", marks=pytest.mark.slow), "least_squares"])
 def test_an_unknown_size_of_the_board_is_covered_by_the_sigmas(method):
     sets = 200 if method == "joint" else 20
     corners = sound(THREE, sets)

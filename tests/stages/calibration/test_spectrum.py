@@ -184,6 +184,7 @@ def normalised_error(seed: int, length_mm: float | None) -> float:
     return float(error @ torch.linalg.solve(result.motion.covariance, error))
 
 
+@pytest.mark.slow
 def test_a_random_motion_is_no_sum_of_waves():
     torch.manual_seed(6)
     motion = random_motion(2, 40.0)

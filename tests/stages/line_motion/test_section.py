@@ -86,6 +86,7 @@ def test_wear_does_not_draw_the_section(kind: str, seed: int) -> None:
     assert "section EN60E1: at q_x 176" in fit.in_words
 
 
+@pytest.mark.slow
 def test_sigma_covers_the_place() -> None:
     errors, sigma = [], []
     for seed in range(40):

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import pytest
 import torch
 
 from lsvision.geometry import quantities_of
@@ -24,6 +25,7 @@ def sigma_of(rig: RawRig) -> torch.Tensor:
     return torch.tensor(rig.covariance, dtype=torch.float64).diagonal().sqrt()
 
 
+@pytest.mark.slow
 def test_a_second_calibration_goes_on_where_the_first_ended():
     """Sigmas are stated a little large: no scale of the noise is then estimated, which few boards have of their own.
 
