@@ -57,9 +57,11 @@ class ShakenScans:
         write_line_motion(self._true_motion(), log)
 
         def checked(name: str) -> BoardCheck:
+            """A board's product, with the motion that its own scan showed."""
             return check_board(self.board, self.corners[name], self._product(name, str(files[name]), bars))
 
         def sheet(source: str) -> SheetCheck:
+            """The sheet's product against its artwork, with one source of the motion of its lines."""
             product = self._product("sheet", str(log) if source == "log" else source, bars)
             line_motion: Any = product.metadata["line_motion"]
             color, height = in_memory(product)

@@ -154,6 +154,14 @@ def triangulation_jacobian(
     return torch.stack(rows, dim=-2)
 
 
+def mean_column_jacobian(
+    rig: Rig, left_px: Float[Tensor, "*batch"], disparity_px: Float[Tensor, "*batch"]
+) -> Float[Tensor, "*batch 2 2"]:
+    """Derivative of (x, z) by the mean of both columns and their disparity, mm/px: independent where noise is alike."""
+    by_left, by_disparity = triangulation_jacobian(rig, left_px, disparity_px).unbind(-1)
+    return torch.stack([by_left, by_disparity + by_left / 2], dim=-1)
+
+
 def depth_map_jacobian(
     rig: Rig, left_px: Float[Tensor, "*batch"], z: Float[Tensor, "*batch"]
 ) -> Float[Tensor, "*batch 2 2"]:

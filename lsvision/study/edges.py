@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from lsvision.geometry import project, scan_position, transform, triangulation_jacobian
+from lsvision.geometry import mean_column_jacobian, project, scan_position, transform
 from lsvision.stages.corners.edges import ends_of_edges
 from lsvision.types import Board, BoardEdges, Pose, Rig
 
@@ -15,23 +15,24 @@ _RIM = 0.2  # share of an edge at either end that is left out, as in an image
 _STEEPEST = 2.0  # mm across per mm along: a flatter edge is a blur along the line
 
 
-def exact_edges(rig: Rig, board: Board, pose: Pose, n: Float[Tensor, "3"]) -> BoardEdges:
+def exact_edges(
+    rig: Rig, board: Board, pose: Pose, n: Float[Tensor, "3"], line_pitch_mm: float = _PITCH_MM
+) -> BoardEdges:
     """The edges of a board that moves by n, without noise.
 
     Args:
-        pose: of the board before it moves.
+        pose: of the board before it moves. line_pitch_mm: between the lines on which the edges are seen.
     """
     ends = ends_of_edges(board.corner_points(), board)
     start, stop = (scan_position(transform(pose.rotation, pose.translation, points), n) for points in ends)
-    crossings = _Crossings.of(start, stop)
+    crossings = _Crossings.of(start, stop, line_pitch_mm)
     segment = crossings.segment
     points = torch.lerp(start[segment], stop[segment], crossings.share[:, None])
     left, right = project(rig, points[:, 0], points[:, 2])
-    by_left, by_disparity = triangulation_jacobian(rig, left, left - right).unbind(-1)
     return BoardEdges(
         scan="",
         points=points,
-        by_column=torch.stack([by_left, by_disparity + by_left / 2], dim=-1),
+        by_column=mean_column_jacobian(rig, left, left - right),
         sigma_px=torch.ones_like(left),
         start=ends[0][segment],
         stop=ends[1][segment],
@@ -62,12 +63,12 @@ class _Crossings:
     share: Float[Tensor, " crossings"]
 
     @classmethod
-    def of(cls, start: Float[Tensor, "segments 3"], stop: Float[Tensor, "segments 3"]) -> "_Crossings":
+    def of(cls, start: Float[Tensor, "segments 3"], stop: Float[Tensor, "segments 3"], pitch_mm: float) -> "_Crossings":
         """Of edges between measured points, mm."""
         across, along, _ = (stop - start).unbind(-1)
         first, last = torch.stack([start[:, 1], stop[:, 1]]).aminmax()
-        lines = torch.arange(int(first / _PITCH_MM), int(last / _PITCH_MM) + 1)
-        share = (lines * _PITCH_MM - start[:, 1:2]) / along[:, None]
+        lines = torch.arange(int(first / pitch_mm), int(last / pitch_mm) + 1)
+        share = (lines * pitch_mm - start[:, 1:2]) / along[:, None]
         seen = (share > _RIM) & (share < 1.0 - _RIM) & (across.abs() <= _STEEPEST * along.abs())[:, None]
         segment, index = seen.nonzero().unbind(-1)
         return cls(segment, lines[index], share[segment, index])

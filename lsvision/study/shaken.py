@@ -6,29 +6,21 @@ a few waves. The crossings err by white noise of their mean column and of their 
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import pad
 
 from lsvision.estimation.gaussian_process import covariance_root, matern32
-from lsvision.geometry import (
-    middle_point,
-    project,
-    scan_position,
-    shaken,
-    transform,
-    triangulate,
-    triangulation_jacobian,
-)
+from lsvision.geometry import mean_column_jacobian, middle_point, project, shaken, triangulate
+from lsvision.study.edges import exact_edges
 from lsvision.study.points import ExactCorners
-from lsvision.types import Board, BoardCorners, BoardEdges, Rig
+from lsvision.types import Board, BoardCorners, BoardEdges, Pose, Rig
 
 _BEYOND_MM = 20.0  # that a scan reaches beyond its board
 _FIRST_MM, _LAST_MM = -100.0, 520.0  # travel at which random motion is drawn
-_INNER = (0.2, 0.8)  # part of a square's edge that is measured
 
 
 @dataclass(frozen=True)
@@ -106,8 +98,9 @@ def shaken_scans(
         moved = points + noise.corner_mm * torch.randn(points.shape, generator=chance, dtype=torch.float64)
         moved[:, ::2] = shaken(moved[:, ::2], motion.at(index, points[:, 1]), middle_point(rig))
         scans.corners.append(_corners(exact, index, moved, noise))
-        crossed = _crossed(board, exact, index, noise.line_pitch_mm)
-        scans.edges.append(_seen(rig, crossed, motion.at(index, crossed.still[:, 1]), noise, chance))
+        pose = Pose(exact.rotation[index], exact.translation[index])
+        still = replace(exact_edges(rig, board, pose, exact.n, noise.line_pitch_mm), scan=scans.corners[index].scan)
+        scans.edges.append(_seen(rig, still, motion.at(index, still.points[:, 1]), noise, chance))
     return scans
 
 
@@ -120,48 +113,19 @@ def _corners(exact: ExactCorners, index: int, points: Tensor, noise: ScanNoise) 
     return BoardCorners(f"scan_{index}", points, covariance, seen, body, points[:, :2], travel_mm=lines)
 
 
-@dataclass(frozen=True)
-class _Crossed:
-    """Where lines cross the edges along Y of a board that does not vibrate: (x, travel, z) in ``still``."""
-
-    scan: str
-    still: Float[Tensor, "crossings 3"]
-    start: Float[Tensor, "crossings 3"]
-    stop: Float[Tensor, "crossings 3"]
-    segment: Int[Tensor, " crossings"]
-    line: Int[Tensor, " crossings"]
-
-
-def _crossed(board: Board, exact: ExactCorners, index: int, pitch_mm: float) -> _Crossed:
-    nx, ny = board.inner
-    grid = exact.board_points[index].unflatten(0, (ny, nx))
-    start, stop = grid[:-1].flatten(0, 1), grid[1:].flatten(0, 1)
-    rotation, translation = exact.rotation[index], exact.translation[index]
-    begin, end = (scan_position(transform(rotation, translation, side), exact.n) for side in (start, stop))
-    line = torch.arange(int(begin[:, 1].min() / pitch_mm), int(end[:, 1].max() / pitch_mm) + 1)
-    share = (line * pitch_mm - begin[:, 1:2]) / (end[:, 1:2] - begin[:, 1:2])
-    segment, at = ((share > _INNER[0]) & (share < _INNER[1])).nonzero().unbind(-1)
-    still = torch.lerp(begin[segment], end[segment], share[segment, at][:, None])
-    return _Crossed(f"scan_{index}", still, start[segment], stop[segment], segment, line[at])
-
-
 def _seen(
-    rig: Rig, crossed: _Crossed, motion: Float[Tensor, "crossings 4"], noise: ScanNoise, chance: torch.Generator
+    rig: Rig, edges: BoardEdges, motion: Float[Tensor, "crossings 4"], noise: ScanNoise, chance: torch.Generator
 ) -> BoardEdges:
-    x, z = shaken(crossed.still[:, ::2], motion, middle_point(rig)).unbind(-1)
+    """Edges whose lines a motion displaced, with noise."""
+    x, z = shaken(edges.points[:, ::2], motion, middle_point(rig)).unbind(-1)
     left, right = project(rig, x, z)
     drawn = torch.randn(2, len(x), generator=chance, dtype=torch.float64)
     column, disparity = noise.column_px * drawn[0], noise.disparity_px * drawn[1]
     left, right = left + column + disparity / 2, right + column - disparity / 2
-    by_left, by_disparity = triangulation_jacobian(rig, left, left - right).unbind(-1)
     x, z = triangulate(rig, left, left - right)
-    return BoardEdges(
-        scan=crossed.scan,
-        points=torch.stack([x, crossed.still[:, 1], z], -1),
-        by_column=torch.stack([by_left, by_disparity + by_left / 2], -1),
+    return replace(
+        edges,
+        points=torch.stack([x, edges.points[:, 1], z], -1),
+        by_column=mean_column_jacobian(rig, left, left - right),
         sigma_px=torch.full_like(x, noise.disparity_px),
-        start=crossed.start,
-        stop=crossed.stop,
-        segment=crossed.segment,
-        line=crossed.line,
     )

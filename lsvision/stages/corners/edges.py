@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from lsvision.geometry import Rectification, line_at, travel_at, triangulate, triangulation_jacobian
+from lsvision.geometry import Rectification, line_at, mean_column_jacobian, travel_at, triangulate
 from lsvision.image.board.edges import EdgeSegments
 from lsvision.stages.corners.crossed import CrossedPair, same_lines, same_points
 from lsvision.stages.corners.rows import row_difference
@@ -69,8 +69,7 @@ class _Placed:
         if rectification is None:
             disparity = crossed.left_px - crossed.right_px
             x, z = triangulate(scan.rig, crossed.left_px, disparity)
-            by_left, by_disparity = triangulation_jacobian(scan.rig, crossed.left_px, disparity).unbind(-1)
-            by_column = torch.stack([by_left, by_disparity + by_left / 2], dim=-1)
+            by_column = mean_column_jacobian(scan.rig, crossed.left_px, disparity)
         else:
             x, z = _met(rectification, crossed.left_px, crossed.right_px).unbind(-1)
             by_column = _met_by_column(rectification, crossed.left_px, crossed.right_px)

@@ -12,7 +12,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from lsvision.estimation import BorderedState
+from lsvision.estimation import BorderedState, lower_factor
 from lsvision.stages.rig.config import RigConfig
 from lsvision.stages.rig.model import QUANTITIES, RigPrior
 from lsvision.stages.rig.solve import RigSolution, corner_residuals, fit_rig
@@ -25,7 +25,8 @@ def contradicted(solution: RigSolution, config: RigConfig) -> str | None:
     """What the corners contradict of the data sheet, as a sentence; None where they fit it."""
     prior, kept = solution.model.prior, solution.sightings
     usual = RigPrior.of(replace(prior.rig, sigma=(), covariance=None), config)
-    model = replace(solution.model, prior=replace(prior, root=_factor(prior.root, usual.root)))
+    less_sure = replace(prior, root=lower_factor(torch.cat([prior.root, usual.root], dim=-1)))
+    model = replace(solution.model, prior=less_sure)
     weight = solution.noise_scale.reciprocal().expand(kept.valid.shape)
     own = solution.found.state
     freed = fit_rig(model, kept, BorderedState(torch.zeros_like(own.shared), own.own), weight, config)
@@ -45,10 +46,3 @@ def contradicted(solution: RigSolution, config: RigConfig) -> str | None:
         f"the corners contradict the data sheet: it says {RIG_QUANTITIES[worst]} {value:.6g} {sure}, they show "
         f"{value + float(off[worst]):.6g} ± {float(seen[worst]):.2g}; check it, or state a larger sigma"
     )
-
-
-def _factor(first: Tensor, second: Tensor) -> Tensor:
-    """A square root of the sum of two covariances, from theirs."""
-    scale = torch.hypot(first.norm(dim=-1), second.norm(dim=-1))[:, None]
-    both = torch.cat([first, second], dim=-1) / scale
-    return scale * torch.linalg.qr(both.mT).R.mT

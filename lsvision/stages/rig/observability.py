@@ -20,8 +20,8 @@ _MENTIONED = 0.25  # of a direction's length: a component that is named
 def unobserved(solution: RigSolution, shape: HeightShape, config: RigConfig) -> tuple[RigCombination, ...]:
     """The combinations whose sigma is more than a share of the prior's, the least known first.
 
-    A data sheet that is itself a calibration counts as scans: what it leaves is held against the usual sigmas. What the
-    data sheet calls exact is no combination.
+    Where the data sheet is itself a calibration, the usual sigmas take the place of the prior's: the boards that it was
+    made from are scans too. What the data sheet calls exact is no combination.
 
     Args:
         solution: of one problem.

@@ -158,6 +158,7 @@ class _Slopes:
 
     @classmethod
     def of(cls, spectrum: Spectrum) -> "_Slopes":
+        """Those by the logarithms of the variances that matter, and by the frequencies of the waves."""
         both, waves = _all_variances(spectrum), spectrum.waves
         total = both.sum(-1, keepdim=True)
         active = (both > torch.maximum(_ACTIVE * total, _ACTIVE_AT_ALL * total.amax())).nonzero()
