@@ -61,20 +61,19 @@ def test_a_line_whose_skew_no_memory_holds(monkeypatch, tmp_path, megabytes):
 
 # Peak memory, MB, of planning, correcting and validating a scan, one after the other.
 PEAK = """
-import resource, sys
+import sys
 from pathlib import Path
 from lsvision.experiments.correct import CorrectSettings, run_correct
 from lsvision.experiments.validate import ValidateSettings, run_validate
 from lsvision.types import Board
 from lsvision.archive import plan_one
 from tests.archive.archives import PROCESSING
+from tests.memory import peak_memory_mb as peak
 from dataclasses import replace
 import torch
 torch.set_num_threads(1)
 scan, calibration, output = map(Path, sys.argv[1:])
 correction = replace(PROCESSING.correction, strip_rows=512)
-def peak():
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 peaks = []
 plan_one(scan, calibration, PROCESSING)
 peaks.append(peak())

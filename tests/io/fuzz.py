@@ -42,6 +42,7 @@ from lsvision.io import (
 from lsvision.types import LineMotion, ProductGrid, ProductStrip
 from tests.archive.archives import make_calibration, make_scan
 from tests.io.formats.test_mutated import mutated
+from tests.memory import peak_memory_mb
 
 MOST_BYTES = 2**31
 MOST_SECONDS = 10
@@ -203,8 +204,7 @@ def main(root: Path, number: int) -> None:
             if fault is not None:
                 faults.append(f"{name}: {fault}")
         target.file.write_bytes(whole)
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024
-    print(json.dumps({"inputs": inputs, "faults": faults, "peak_mb": peak}))
+    print(json.dumps({"inputs": inputs, "faults": faults, "peak_mb": round(peak_memory_mb())}))
 
 
 if __name__ == "__main__":

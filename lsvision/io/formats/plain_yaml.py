@@ -9,7 +9,6 @@ import yaml
 
 _MAX_DEPTH = 20
 _MAX_DIGITS = 40
-_SHORT = 20_000  # characters of a text whose data may stay in memory
 _YAML = "tag:yaml.org,2002:"
 _STR, _INT, _FLOAT, _BOOL, _NULL = (_YAML + name for name in ("str", "int", "float", "bool", "null"))
 # Values of this key at the top are texts: a heat 0123 or a version 1.10 is no number.
@@ -98,16 +97,12 @@ def load_plain_yaml(text: str) -> object:
     Raises:
         ValueError: not YAML, or more than plain data; says where and what, and repeats no more of the text than a key.
     """
-    return copy.deepcopy(_kept(text)) if len(text) <= _SHORT else _parsed(text)
+    return copy.deepcopy(_parsed(text))
 
 
 @lru_cache(maxsize=16)
-def _kept(text: str) -> object:
-    """Parsed once: every strip of an archive looks whether its scan is still what it was."""
-    return _parsed(text)
-
-
 def _parsed(text: str) -> object:
+    """Parsed once: every strip of an archive looks whether its scan is still what it was."""
     try:
         loader = PlainLoader(text)
         data: object = loader.get_single_data()
