@@ -9,8 +9,8 @@ the freedom of their frequencies allowed for.
 Source: Solin & Särkkä 2014; MacKay 2003, Information Theory, Inference, and Learning Algorithms, ch. 28.
 """
 
+from collections.abc import Iterator
 from dataclasses import replace
-from functools import partial
 
 import torch
 from jaxtyping import Float, Int
@@ -60,12 +60,22 @@ def with_waves(equations: NormalEquations, kernels: Spectrum) -> Spectrum:
 def _better(equations: NormalEquations, spectrum: Spectrum) -> Spectrum | None:
     """A more probable spectrum of one wave more; None where none is found."""
     least = of_waves(equations, spectrum)
-    tried = [_one_more, *(partial(_parted, wave=wave) for wave in spectrum.of_waves.sum(0).argsort(descending=True))]
-    for add in tried:
-        further = add(equations, spectrum)
-        if further is not None and of_waves(equations, further) > least:
-            return further
-    return None
+    return next(
+        (further for further in _of_one_more(equations, spectrum) if of_waves(equations, further) > least), None
+    )
+
+
+def _of_one_more(equations: NormalEquations, spectrum: Spectrum) -> Iterator[Spectrum]:
+    """Spectra of one wave more: that which the data show most, and with two in place of each wave, the largest first.
+
+    The latter only where broad-band errors take a part: two waves that beat are taken for one and something broad.
+    """
+    further = _one_more(equations, spectrum)
+    if further is not None:
+        yield further
+    if bool(spectrum.variances.sum() > _BEATING * spectrum.total.sum()):
+        for wave in spectrum.of_waves.sum(0).argsort(descending=True):
+            yield _parted(equations, spectrum, wave)
 
 
 def of_waves(equations: NormalEquations, spectrum: Spectrum) -> float:
@@ -102,10 +112,8 @@ def _broad(equations: NormalEquations, like: Spectrum) -> Float[Tensor, "4 kerne
     return broad
 
 
-def _parted(equations: NormalEquations, spectrum: Spectrum, wave: Tensor) -> Spectrum | None:
-    """A spectrum with two waves in place of one; None where broad-band errors take nothing, as of what they beat like."""
-    if not bool(spectrum.variances.sum() > _BEATING * spectrum.total.sum()):
-        return None
+def _parted(equations: NormalEquations, spectrum: Spectrum, wave: Tensor) -> Spectrum:
+    """A spectrum with two waves in place of one."""
     frequency, variance = spectrum.frequency.clone(), spectrum.of_waves.clone()
     frequency[wave] -= _APART
     variance[:, wave] /= 2
