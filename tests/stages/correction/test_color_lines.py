@@ -23,6 +23,7 @@ from lsvision.stages.correction.config import CorrectionConfig
 from lsvision.stages.correction.correct import correct_scan
 from lsvision.stages.disparity.depth import depth_of
 from lsvision.types import DepthView, Motion, Rig, Scan, TensorImage, Transport
+from tests.combinations import crossed
 from tests.stages.rendered import BOARD, PITCH, SMALL_RIG
 
 MOTION = MotionConfig(angle_x_deg=-2.0, angle_z_deg=2.0, stretch=1.07)
@@ -86,9 +87,7 @@ def shift_along(image: Tensor, truth: Tensor) -> float:
     return -total
 
 
-@pytest.mark.parametrize("encoder", [None, WOBBLE], ids=["constant", "encoder"])
-@pytest.mark.parametrize("transport", ["forward", "reverse"])
-@pytest.mark.parametrize("registered", [False, True], ids=["raw", "registered"])
+@crossed("registered transport encoder", [False, True], ["forward", "reverse"], [None, WOBBLE])
 def test_red_and_blue_meet(registered: bool, transport: Transport, encoder: EncoderConfig | None) -> None:
     options = {"registered": registered, "transport": transport, "encoder": encoder}
     truth = truth_of(transport, encoder)
