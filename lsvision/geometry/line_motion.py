@@ -13,7 +13,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from lsvision.geometry.motion import travel_at
@@ -89,17 +89,23 @@ def uneven_travel(travel: Travel, line_motion: LineMotion) -> Travel:
     return Travel(travel.line_pitch_mm, positions, travel.transport, travel.sigma_mm)
 
 
-def without_trend(along_mm: Float[Tensor, " lines"]) -> Callable[[Float[Tensor, "*batch lines"]], Tensor]:
+def without_trend(
+    along_mm: Float[Tensor, " lines"], measured: Bool[Tensor, " lines"] | None = None
+) -> Callable[[Float[Tensor, "*batch lines"]], Tensor]:
     """A function that removes the mean and the linear trend over the travel: the gauge of motion from line to line.
 
     Args:
         along_mm: travel of the lines, mm.
+        measured: the lines, one at least, over which mean and trend are taken; None for all. The line that fits them
+            is removed from every line.
     """
-    centred = along_mm - along_mm.mean()
-    power = centred.square().sum().clamp(min=torch.finfo(centred.dtype).tiny)
+    share = torch.ones_like(along_mm) if measured is None else measured.to(along_mm)
+    share = share / share.sum()
+    centred = along_mm - (share * along_mm).sum()
+    power = (share * centred.square()).sum().clamp(min=torch.finfo(centred.dtype).tiny)
 
     def remove(values: Tensor) -> Tensor:
-        level = values - values.mean(-1, keepdim=True)
-        return level - (level * centred).sum(-1, keepdim=True) / power * centred
+        level = values - (share * values).sum(-1, keepdim=True)
+        return level - (share * level * centred).sum(-1, keepdim=True) / power * centred
 
     return remove

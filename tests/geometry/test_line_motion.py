@@ -160,6 +160,15 @@ def test_gauge_has_neither_mean_nor_trend() -> None:
     assert torch.equal(without_trend(along[:1])(values[..., :1]), torch.zeros(2, 3, 1).double())
 
 
+def test_gauge_of_the_lines_that_were_measured() -> None:
+    along, values = torch.arange(LINES).double(), torch.randn(3, LINES).double()
+    some = along < LINES // 2
+    found = without_trend(along, some)(values)
+    torch.testing.assert_close(found[:, some], without_trend(along[some])(values[:, some]), rtol=0, atol=1e-12)
+    removed = values - found
+    torch.testing.assert_close(removed.diff(n=2), torch.zeros(3, LINES - 2).double(), rtol=0, atol=1e-12)
+
+
 def test_uneven_travel_keeps_the_order_of_lines() -> None:
     motion = random_motion(dy_mm=1.0)
     with pytest.raises(ValueError, match="dy_mm must leave the lines in their order"):

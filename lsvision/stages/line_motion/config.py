@@ -14,7 +14,8 @@ class LineMotionConfig(Checked):
     count as not measured. Every line is registered to it in ``iterations`` of Gauss-Newton steps; a sample counts the
     less the further it lies off, and not at all beyond ``cut_sigma`` of its standard deviations: defects are outliers.
     Of the columns at most ``samples`` are used, as neighbours err alike. A line of which less than ``min_share`` of the
-    object's samples was measured is interpolated from the others; so are all lines of which too few are left.
+    object's samples was measured is interpolated from the others. So is one that lies more than ``largest_mm`` above or
+    below most lines: it shows another object, as the conveyor before and behind a sheet.
     ``reference`` is ``scan``; or a nominal section: ``EN60E1``, the head of the rail 60E1, or the path of a CSV with
     the columns across_mm and height_mm. It is laid on the scan's own mean profile and takes its place, without its
     noise, where at least half of that lies within ``section_within_mm`` of the section. What departs from it is added.
@@ -41,6 +42,7 @@ class LineMotionConfig(Checked):
     iterations: IntFrom2 = 4
     cut_sigma: Positive = 4.0
     min_share: Share = 0.3
+    largest_mm: Positive = 10.0
     common_error_px: NonNegative = 0.004
     expected_x_mm: Positive = 0.2
     expected_z_mm: Positive = 0.2

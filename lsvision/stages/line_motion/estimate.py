@@ -73,9 +73,10 @@ def estimate(
     mean, covariance = smooth_signals(fit.parameters.model(), data, block=config.block_lines, halo=config.halo_lines)
     kept = fit.is_corrected(config)
     mean, covariance = _without_the_others(mean, covariance, kept)
-    mean = without_trend(along_mm)(mean.T).T
+    mean = without_trend(along_mm, data.valid)(mean.T).T
     pitch = float(along_mm.diff().abs().mean())
-    findings = [fit.finding(i, mean[:, i], covariance[:, i, i], pitch, config) for i in range(3)]
+    shown = mean[data.valid], covariance[data.valid]
+    findings = [fit.finding(i, shown[0][:, i], shown[1][:, i, i], pitch, config) for i in range(3)]
     return LineMotion(pad(mean, (0, 1)), pad(covariance, (0, 1, 0, 1)), tuple(findings))
 
 
@@ -95,11 +96,12 @@ def _without_the_others(mean: Tensor, covariance: Tensor, kept: Tensor) -> tuple
 
 
 def noisy_values(lines: Registered, usual_samples: int, config: LineMotionConfig) -> NoisyValues:
-    """Values of lines, measured where enough samples took part and the line is no spike among its neighbours."""
+    """Values of lines, measured where enough samples of the object took part and the line is no spike among others."""
     root = torch.linalg.cholesky(lines.covariance)
     valid = (lines.samples >= max(1.0, config.min_share * usual_samples)) & lines.values.isfinite().all(1)
     values = torch.where(valid[:, None], lines.values, torch.nan)
     values = values - values.nanmedian(0).values.nan_to_num()
+    valid &= ~(values[:, 1].abs() > config.largest_mm)  # another object
     half = _SPIKE_LINES // 2
     around = torch.cat([values[:1].expand(half, -1), values, values[-1:].expand(half, -1)]).unfold(0, _SPIKE_LINES, 1)
     medians = [some.nanmedian(-1).values for some in around.split(_LINES_AT_ONCE)]

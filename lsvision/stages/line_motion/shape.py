@@ -63,7 +63,7 @@ def without_shape(motion: LineMotion, data: ShapeData, config: LineMotionConfig)
         if finding.state != "corrected":
             continue
         shape = _shape_of(values[:, index], index, data, finding, config)
-        gauged = without_trend(data.along_mm)(shape.mean)
+        gauged = without_trend(data.along_mm, data.valid)(shape.mean)
         values[:, index] -= gauged
         covariance[:, index, index] += shape.variance
         findings[index] = _finding_with(finding, values[:, index], gauged, shape)

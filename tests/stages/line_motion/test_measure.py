@@ -218,6 +218,20 @@ def test_a_flat_plane_shows_depth_and_roll_alone() -> None:
     assert found.findings[2].sigma < math.radians(0.01)
 
 
+def test_lines_beside_an_object_are_no_motion_of_it() -> None:
+    """The conveyor 26 mm under a sheet, of which the first and last lines show nothing else."""
+    lines, shake = torch.arange(300.0), 0.3 * torch.sin(torch.arange(300.0) / 9)
+    beside = (lines < 60) | (lines >= 270)
+    depth = 810.0 + shake + 26.0 * beside
+    found = measure(matched(depth[:, None].expand(-1, RIG.width_px)))
+    assert states(found) == ["not observed", "corrected", "absent"]
+    expected = without_trend(0.28 * lines.double(), ~beside)(shake.double())
+    error = found.values[:, 1] - expected
+    assert error[~beside].abs().max() < 0.05
+    assert found.findings[1].rms == pytest.approx(float(expected[~beside].square().mean().sqrt()), rel=0.05)
+    assert float((error / found.sigma[:, 1])[beside].square().mean()) < 3.0
+
+
 @pytest.mark.parametrize("columns", [1, 2, 3])
 def test_an_object_of_a_few_columns_is_not_measured(columns: int) -> None:
     _, depth = rendered(STILL)
