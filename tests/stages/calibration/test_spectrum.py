@@ -100,7 +100,7 @@ def test_gradient_and_response_of_n_are_those_of_small_steps():
         slope = (log_posterior(equations, ahead) - log_posterior(equations, back)) / (2 * size)
         assert float(scores.gradient[index]) == pytest.approx(slope, rel=1e-3, abs=1e-3)
         response = (n_of(equations, ahead) - n_of(equations, back)) / (2 * size)
-        torch.testing.assert_close(scores.of_n[:, index], response, rtol=2e-3, atol=1e-9)
+        torch.testing.assert_close(scores.of_shared[:, index], response, rtol=2e-3, atol=1e-9)
     torch.testing.assert_close(scores.information, scores.information.mT)
     assert float(torch.linalg.eigvalsh(scores.information).min()) > -1e-6
 

@@ -39,7 +39,15 @@ def search_with_edges(
     Args:
         near: a spectrum that the search begins near to: of the same kernels, and as many waves.
     """
-    equations = NormalEquations.of(problem, linearised, FINE, edges)
+    return most_probable_errors(NormalEquations.of(problem, linearised, FINE, edges), near)
+
+
+def most_probable_errors(equations: NormalEquations, near: Spectrum | None = None) -> FoundErrors:
+    """The errors along the scans given the normal equations of all data at the fine knots.
+
+    Args:
+        near: as of ``search_with_edges``.
+    """
     if near is not None and not near.waves and not near.variances[:, BROAD:].any():
         return found_errors(equations, near, near)  # a mean over kernels is nothing that steps lead to
     spectrum = _most_probable(equations) if near is None else stepped(equations, near, _STEPS_NEARBY)
@@ -50,11 +58,11 @@ def search_with_edges(
 
 def found_errors(equations: NormalEquations, spectrum: Spectrum, probable: Spectrum) -> FoundErrors:
     """The errors of a spectrum of greatest posterior, which is as large as ``probable`` in the mean."""
-    factor_of_n = Scores.of(equations, spectrum).factor_of_n
+    factor_of_shared = Scores.of(equations, spectrum).factor_of_shared
     kept = probable.variances > _NOTHING * probable.total.amax()
     probable = replace(probable, variances=torch.where(kept, probable.variances, 0.0))
     evidence, log_ratio = evidence_by_component(equations, probable.covariance(FINE)[None])
-    return FoundErrors(probable, log_ratio, probable.total.sqrt(), float(evidence), factor_of_n)
+    return FoundErrors(probable, log_ratio, probable.total.sqrt(), float(evidence), factor_of_shared)
 
 
 def _most_probable(equations: NormalEquations) -> Spectrum:
