@@ -189,9 +189,9 @@ def normalised_error(seed: int, length_mm: float | None) -> float:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [2109, 2379, 2398])
+@pytest.mark.parametrize("seed", [2109, 2379, 2398, 4213])
 def test_waves_are_found_one_by_one(seed):
-    """Three waves that began as five, as kernels alone, or as two: n was 7.5, 13.6 and 5.4 sigmas off."""
+    """Three waves that began as five, kernels alone, two, or three others: n was 5 to 14 sigmas off."""
     chance = torch.Generator().manual_seed(seed)
     poses = [BoardPose(*angles) for angles in ((2, 1.5, 0), (-5, 1, 6), (5, -2, -8), (-1, -3.5, 14))]
     exact = exact_corners(

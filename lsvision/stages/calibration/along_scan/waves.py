@@ -35,7 +35,7 @@ _LEAST_SHARE = 0.05  # of the components' variance, that a wave has at first
 _FAINT = 0.01  # of the largest component's variance: what components of less show is no wave's frequency
 _BEGIN = 1e-3  # variance of each broad-band kernel at first, of that of the residuals
 _ROUNDS, _STEPS, _CLIMBED = 8, 2, 24
-_APART, _BEATING = 0.1, 1e-3  # waves per unit; share of the variance
+_APART, _LONG = 0.1, 2.0  # waves per unit: between those that may beat, and below which n depends on it
 _TWINS = 0.1  # waves per unit within which two are tried as one
 _RESOLVED = 0.1  # waves per unit to which a wave's frequency is known
 _FREE = 4.0  # of the information on a frequency, that keeps a step short where there is none
@@ -66,16 +66,16 @@ def _better(equations: NormalEquations, spectrum: Spectrum) -> Spectrum | None:
 
 
 def _of_one_more(equations: NormalEquations, spectrum: Spectrum) -> Iterator[Spectrum]:
-    """Spectra of one wave more: that which the data show most, and with two in place of each wave, the largest first.
+    """Spectra of one wave more: that which the data show most, and with two in place of each long one, largest first.
 
-    The latter only where broad-band errors take a part: two waves that beat are taken for one and something broad.
+    Two waves that beat are taken for one, with something broad or another wave of twice the frequency.
     """
     further = _one_more(equations, spectrum)
     if further is not None:
         yield further
-    if bool(spectrum.variances.sum() > _BEATING * spectrum.total.sum()):
-        for wave in spectrum.of_waves.sum(0).argsort(descending=True):
-            yield _parted(equations, spectrum, wave)
+    for wave in spectrum.of_waves.sum(0).argsort(descending=True):
+        if bool(spectrum.frequency[wave] < _LONG):
+            yield _settled(equations, _parted(equations, spectrum, wave))
 
 
 def of_waves(equations: NormalEquations, spectrum: Spectrum) -> float:
@@ -114,15 +114,13 @@ def _broad(equations: NormalEquations, like: Spectrum) -> Float[Tensor, "4 kerne
 
 def _parted(equations: NormalEquations, spectrum: Spectrum, wave: Tensor) -> Spectrum:
     """A spectrum with two waves in place of one."""
-    frequency, variance = spectrum.frequency.clone(), spectrum.of_waves.clone()
-    frequency[wave] -= _APART
-    variance[:, wave] /= 2
-    further = Spectrum(
+    kept = torch.arange(spectrum.waves) != wave
+    frequency, half = spectrum.frequency[wave, None], spectrum.of_waves[:, wave, None] / 2
+    return Spectrum(
         _broad(equations, spectrum),
-        torch.cat([frequency, (frequency[wave] + 2 * _APART)[None]]),
-        torch.cat([variance, variance[:, wave, None]], dim=-1),
+        torch.cat([spectrum.frequency[kept], frequency - _APART, frequency + _APART]),
+        torch.cat([spectrum.of_waves[:, kept], half, half], dim=-1),
     )
-    return _settled(equations, further)
 
 
 def _settled(equations: NormalEquations, spectrum: Spectrum) -> Spectrum:
