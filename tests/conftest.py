@@ -1,6 +1,7 @@
 """Shapes are checked while the tests run; every test starts from one seed and one thread."""
 
 import gc
+import os
 import signal
 import sys
 from collections.abc import Callable, Iterator
@@ -8,6 +9,10 @@ from pathlib import Path
 
 import hypothesis
 import pytest
+
+# Before torch is loaded: threads that wait for each other sleep, and leave the processor to xdist's other workers.
+os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+
 import torch
 
 from tests.shapes import install_checks

@@ -19,6 +19,7 @@ from lsvision.archive.work import CorrectStrip, HashInput, MatchStrip
 from lsvision.errors import LsvisionError, ScanChangedError
 from lsvision.io import read_product
 from tests.archive.archives import PROCESSING, InProcess, assert_same_products, make_scan, process, with_strip_rows
+from tests.combinations import crossed
 
 CHANGED = "changed while it was being read; the next run starts it afresh"
 SMALL = replace(with_strip_rows(16), disparity=replace(PROCESSING.disparity, block_lines=16, strip_lines=16))
@@ -76,8 +77,7 @@ def failed_as_changed(rows) -> bool:
     return row.status == "failed" and row.error.endswith(CHANGED)
 
 
-@pytest.mark.parametrize("stereo", [False, True])
-@pytest.mark.parametrize("lines", [32, 64])
+@crossed("stereo lines", [False, True], [32, 64])
 def test_grown_or_shrunk_between_planning_and_its_turn(root, calibration, tmp_path, stereo, lines):
     scan(root, stereo=stereo)
     output = tmp_path / "o"
@@ -93,7 +93,14 @@ def test_grown_or_shrunk_between_planning_and_its_turn(root, calibration, tmp_pa
 
 
 @pytest.mark.parametrize(
-    ("kind", "number"), [(HashInput, 1), (MatchStrip, 1), (MatchStrip, 3), (CorrectStrip, 2), (CorrectStrip, 4)]
+    ("kind", "number"),
+    [
+        (HashInput, 1),
+        (MatchStrip, 3),
+        (CorrectStrip, 4),
+        pytest.param(MatchStrip, 1, marks=pytest.mark.slow),
+        pytest.param(CorrectStrip, 2, marks=pytest.mark.slow),
+    ],
 )
 def test_an_image_replaced_by_one_of_its_size_and_time(root, calibration, tmp_path, kind, number):
     scan(root, stereo=True)

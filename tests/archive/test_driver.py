@@ -160,7 +160,7 @@ def test_touched_files_are_hashed_and_changed_ones_redone(archive, calibration, 
     assert {task.scan for task in work_of(engine, CorrectStrip)} == {"b"}
 
 
-@pytest.mark.parametrize("ended_after", [0, 3, 9, 14, 18])
+@pytest.mark.parametrize("ended_after", [0, 9, 18, *(pytest.param(count, marks=pytest.mark.slow) for count in (3, 14))])
 def test_a_run_that_was_ended_goes_on_where_it_stood(archive, calibration, undisturbed, tmp_path, ended_after):
     class EndError(Exception):
         pass

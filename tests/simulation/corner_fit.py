@@ -6,6 +6,7 @@ from torch import Tensor
 _RADIUS = 5
 _STEPS = 20
 _DIFFERENCE = 1e-5
+_SETTLED_PX = 1e-6
 
 
 def fit_corners(image: Tensor, guess: Tensor, grid: tuple[int, int]) -> Tensor:
@@ -37,9 +38,11 @@ def fit_corners(image: Tensor, guess: Tensor, grid: tuple[int, int]) -> Tensor:
         damped = normal + (damping[:, None] * normal.diagonal(dim1=-2, dim2=-1)).diag_embed()
         tried = parameters - torch.linalg.solve(damped, jacobian.mT @ residual[..., None])[..., 0]
         tried_error = (_corner(tried, window) - values).square().sum(-1)
-        better = tried_error < error
+        better, moved = tried_error < error, (tried - parameters)[:, :2].abs().max()
         parameters, error = torch.where(better[:, None], tried, parameters), torch.minimum(error, tried_error)
         damping = damping * torch.where(better, 0.2, 10.0)
+        if moved < _SETTLED_PX:
+            break
     return base + parameters[:, :2]
 
 

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from lsvision.geometry import RawPair, ideal_rig, scan_position, transform
 from lsvision.io import read_scan
-from lsvision.stages.corners.find import find_corners
+from lsvision.stages.corners.find import LocatedCorners, find_corners, locate_in_images
 from lsvision.types import BoardCorners, RawCamera, Scan, ViewPlane
 from tests.stages.rendered import BOARD
 
@@ -55,6 +55,12 @@ def _truth(scan: Scan) -> dict:
 def raw_scans(shared_data: Path) -> tuple[Scan, ...]:
     """Scans raw_a..raw_h of a raw rig, with the rig that they were rendered with in place of the data sheet's."""
     return tuple(raw_scan(shared_data, f"raw_{name}") for name in "abcdefgh")
+
+
+@cache
+def raw_located(shared_data: Path, name: str) -> LocatedCorners:
+    """The corners in both images of one of these scans."""
+    return locate_in_images(raw_scan(shared_data, name), BOARD)
 
 
 def raw_scan(shared_data: Path, name: str) -> Scan:

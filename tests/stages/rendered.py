@@ -16,7 +16,8 @@ from lsvision.simulation import (
     Simulation,
     simulate,
 )
-from lsvision.types import Board, DepthView, Rig, Scan, StereoPair, TensorImage, Transport
+from lsvision.stages.corners.find import LocatedCorners, find_corners, locate_in_images, measure_corners
+from lsvision.types import Board, BoardCorners, DepthView, Rig, Scan, StereoPair, TensorImage, Transport
 
 FULL_RIG = Rig(7142, 10.0, 113.84, 354.0, 1042.0, 6099.0)
 SMALL_RIG = scaled_rig(FULL_RIG, 16)
@@ -58,6 +59,23 @@ def _image(source: Simulation, camera: Camera) -> Tensor:
 @lru_cache(maxsize=8)
 def _depth(source: Simulation) -> Tensor:
     return torch.cat(list(source.depth_strips()))[..., None]
+
+
+@lru_cache(maxsize=8)
+def located(source: Simulation) -> LocatedCorners:
+    """The board's corners in both images; found once for tests of the same scan."""
+    return locate_in_images(stereo_scan(source), BOARD)
+
+
+def stereo_corners(source: Simulation) -> BoardCorners:
+    """The corners as both images measure them."""
+    return measure_corners(stereo_scan(source), BOARD, located(source))
+
+
+@lru_cache(maxsize=8)
+def depth_corners(source: Simulation) -> BoardCorners:
+    """The corners as one image and a depth map measure them."""
+    return find_corners(depth_scan(source), BOARD)
 
 
 def true_measurement(source: Simulation) -> Tensor:

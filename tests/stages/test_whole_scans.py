@@ -14,6 +14,7 @@ from lsvision.stages.correction.correct import correct_scan
 from lsvision.stages.correction.grid import plan_product
 from lsvision.stages.disparity.depth import depth_of
 from lsvision.types import DepthView, Motion, Rig, Scan, TensorImage, Travel
+from tests.combinations import crossed
 
 PITCH = 0.56
 # An eighth of the camera's pixels, and a field of two tiles.
@@ -60,8 +61,7 @@ OPTIONS = {
 }
 
 
-@pytest.mark.parametrize("options", OPTIONS)
-@pytest.mark.parametrize("rig", [RIG, dataclasses.replace(RIG, color_spacing_lines=(-2.0, 0.0, 2.0))], ids=["", "tri"])
+@crossed("options rig", list(OPTIONS), [RIG, dataclasses.replace(RIG, color_spacing_lines=(-2.0, 0.0, 2.0))])
 def test_strips_of_any_height_and_threads_change_no_bit(options, rig):
     config = dataclasses.replace(CONFIG, **OPTIONS[options])
     scan = rough_scan(Travel(PITCH), rig)

@@ -15,7 +15,7 @@ next to nothing: vignetting looks like a shaded object. So only waves up to ``ob
 """
 
 import math
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field
 
 import torch
 import torch.nn.functional as F  # noqa: N812
@@ -23,24 +23,26 @@ from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 
 from lsvision.estimation import NORMAL_OVER_MAD
+from lsvision.stages.response.gain_equations import GainEquations
 
 _BIN_PX = 0.5  # of wander, whose lines are averaged
 _LEAST_SHARE = 0.1  # of the information, that counts as observed
-_ROUNDS, _SETTLED = 60, 1e-14  # of conjugate gradients; of the first residual, squared
 _ALIKE = 0.002  # of a gain: what patterns between two columns and bins leave in both halves, on drawn streaks and edges
 _GROUPED = 4  # neighbouring segments that fall to one half of the lines: streaks reach over some
-_FEWEST = 4  # bins that must have a column
-_LONGEST_PX = 4096
+_WAVES = torch.logspace(math.log10(2.0), math.log10(4096), 400, dtype=torch.float64)  # columns
 
 
 @dataclass
 class WanderSums:
-    """Sums of logarithms of codes by segment of the travel and wander.
+    """Normal equations of the gains, summed segment by segment of the travel; halves of these show the errors.
 
-    The pattern of the object may change from segment to segment. Halves of the segments show the errors.
+    The pattern of the object may change from segment to segment.
     """
 
-    _parts: list["_Means"] = field(default_factory=list, init=False, repr=False)
+    _segment: int = field(default=0, init=False)
+    _open: list["_Bins"] = field(default_factory=list, init=False, repr=False)
+    _halves: dict[int, GainEquations] = field(default_factory=dict, init=False, repr=False)
+    _spread: "_Spread" = field(default_factory=lambda: _Spread(), init=False, repr=False)
 
     def add(
         self,
@@ -49,92 +51,112 @@ class WanderSums:
         wander_px: Float[Tensor, " lines"],
         segment: int,
     ) -> None:
-        """Add lines of a segment.
+        """Add lines of a segment, those of one segment after the other.
 
         Args:
             codes: over the dark. seen: samples that show the object. wander_px: of each line, from any zero.
             segment: its number; the pattern of the object is one within it.
         """
-        known = seen & (codes > 0).all(-1)
-        logs = codes.double().clamp(min=1e-3).log() * known[..., None]
-        place, line = (wander_px / _BIN_PX).round().long().unique(return_inverse=True)
-        count = torch.zeros(len(place), known.shape[1], dtype=torch.float64).index_add_(0, line, known.double())
-        sums = torch.zeros(*count.shape, codes.shape[-1], dtype=torch.float64).index_add_(0, line, logs)
-        mean = sums / count.clamp(min=1)[..., None]
-        self._parts.append(_Means(mean, count, place * _BIN_PX, torch.full_like(place, segment)))
+        if segment != self._segment:
+            self._close()
+            self._segment = segment
+        self._open.append(_Bins.of(codes, seen, wander_px))
 
     def gains(self) -> "WanderGains":
-        """The gains that the lines show, and how well."""
-        whole = _Means.joined(self._parts)
-        halves = [[part for part in self._parts if int(part.segment[0]) // _GROUPED % 2 == half] for half in (0, 1)]
-        log_gain = _without_long(_solve(whole), whole.observed_px)
+        """The gains that the lines show, and how well; of one line at least."""
+        self._close()
+        observed_px, halves = self._spread.observed_px, list(self._halves.values())
+        log_gain = _without_long((halves[0] + halves[1] if len(halves) > 1 else halves[0]).solved(), observed_px)
         halved = torch.full_like(log_gain, torch.inf)
-        if all(halves):
-            one, other = (_without_long(_solve(_Means.joined(half)), whole.observed_px) for half in halves)
+        if len(halves) > 1:
+            one, other = (_without_long(half.solved(), observed_px) for half in halves)
             halved = (one - other).abs() / 2
-        return WanderGains(log_gain, halved, whole.observed_px, whole.wander_rms)
+        return WanderGains(log_gain, halved, observed_px, self._spread.wander_rms)
+
+    def _close(self) -> None:
+        """Sum up the segment whose lines were added."""
+        if not self._open:
+            return
+        bins = _Bins.joined(self._open)
+        self._open.clear()
+        self._spread.add(bins)
+        equations = GainEquations.of_segment(bins.sums, bins.weight, bins.place_px)
+        half = self._segment // _GROUPED % 2
+        self._halves[half] = self._halves[half] + equations if half in self._halves else equations
 
 
 @dataclass(frozen=True)
-class _Means:
-    """Means of logarithms by bin and column, their weights, and the wander, px, and segment of each bin."""
+class _Bins:
+    """Sums of logarithms of one segment by wander and column, and how many samples they are of."""
 
-    mean: Float[Tensor, "bins width channels"]
+    number: Int[Tensor, " bins"]
+    sums: Float[Tensor, "bins width channels"]
     weight: Float[Tensor, "bins width"]
-    place: Float[Tensor, " bins"]
-    segment: Int[Tensor, " bins"]
 
     @classmethod
-    def joined(cls, parts: list["_Means"]) -> "_Means":
-        """Those of several segments, which are numbered anew from 0 on."""
-        whole = cls(*(torch.cat([getattr(part, item.name) for part in parts]) for item in fields(cls)))
-        return replace(whole, segment=whole.segment.unique(return_inverse=True)[1])
+    def of(
+        cls, codes: Shaped[Tensor, "lines width channels"], seen: Bool[Tensor, "lines width"], wander_px: Tensor
+    ) -> "_Bins":
+        """Those of some lines."""
+        known = (seen & (codes > 0).all(-1)).double()
+        logs = codes.double().clamp(min=1e-3).log() * known[..., None]
+        return cls((wander_px / _BIN_PX).round().long(), logs, known)._summed()
+
+    @classmethod
+    def joined(cls, parts: list["_Bins"]) -> "_Bins":
+        """Those of all lines of several."""
+        number, sums, weight = (torch.cat([getattr(part, name) for part in parts]) for name in cls.__annotations__)
+        return cls(number, sums, weight)._summed()
+
+    @property
+    def place_px(self) -> Float[Tensor, " bins"]:
+        """Wander of each bin."""
+        return self.number.double() * _BIN_PX
+
+    def _summed(self) -> "_Bins":
+        """With one bin of each number."""
+        number, bin_of = self.number.unique(return_inverse=True)
+        sums, weight = (
+            values.new_zeros(len(number), *values.shape[1:]).index_add_(0, bin_of, values)
+            for values in (self.sums, self.weight)
+        )
+        return _Bins(number, sums, weight)
+
+
+@dataclass
+class _Spread:
+    """How far the object wanders within segments: sums over these, each by its number of samples."""
+
+    samples: float = 0.0
+    squares: float = 0.0
+    hidden: Float[Tensor, " waves"] = field(default_factory=lambda: torch.zeros_like(_WAVES))
+
+    def add(self, bins: _Bins) -> None:
+        """Add a segment."""
+        count, place = bins.weight.sum(1), bins.place_px
+        total = float(count.sum())
+        if total == 0:
+            return
+        off = place - (count * place).sum() / total
+        turn = (torch.exp(2j * math.pi / _WAVES * off[:, None]) * count[:, None]).sum(0)
+        self.samples += total
+        self.squares += float((count * off.square()).sum())
+        self.hidden = self.hidden + turn.abs().square() / total
 
     @property
     def wander_rms(self) -> float:
         """Rms of the wander within segments, px."""
-        lines = self.weight.double().sum(1)
-        total, moment = (self._by_segment(values) for values in (lines, lines * self.place))
-        off = self.place - (moment / total.clamp(min=1e-9))[self.segment]
-        return float((lines * off.square()).sum().div(lines.sum().clamp(min=1e-9)).sqrt())
+        return math.sqrt(self.squares / max(self.samples, 1.0))
 
     @property
     def observed_px(self) -> float:
         """Longest wave, columns, of which the wander leaves a tenth of the information; 0 where there is none."""
-        lines = self.weight.double().sum(1)
-        if float(lines.sum()) == 0:
+        if self.samples == 0:
             return 0.0
-        waves = torch.logspace(math.log10(2.0), math.log10(_LONGEST_PX), 400, dtype=torch.float64)
-        turn = torch.exp(2j * math.pi / waves * self.place[:, None]) * lines[:, None]
-        total = self._by_segment(lines).clamp(min=1e-9)
-        hidden = (self._by_segment(turn).abs().square() / total[:, None]).sum(0) / lines.sum()
-        blind = (1 - hidden < _LEAST_SHARE).nonzero()[:, 0]
+        blind = (1 - self.hidden / self.samples < _LEAST_SHARE).nonzero()[:, 0]
         if not len(blind):
-            return float(waves[-1])
-        return float(waves[int(blind[0]) - 1]) if int(blind[0]) else 0.0
-
-    def without_pattern(self, values: Float[Tensor, "bins width channels"]) -> Tensor:
-        """Values less the pattern of the object that fits them best in each segment."""
-        margin = int(self.place.abs().max()) + 2
-        pad = (margin, margin)
-        summed = self._by_segment(_shifted(F.pad((values * self.weight[..., None]).mT, pad).mT, self.place))
-        known = self._by_segment(_shifted(F.pad(self.weight, pad)[..., None], self.place))
-        pattern = summed / known.clamp(min=1e-9)
-        back = _shifted(pattern[self.segment], -self.place)
-        return values - back[:, margin : margin + values.shape[1]]
-
-    def right_side(self, values: Float[Tensor, "bins width channels"]) -> Tensor:
-        """Sum over the bins of what no pattern explains."""
-        return (self.weight[..., None] * self.without_pattern(values)).sum(0).double()
-
-    def applied(self, gain: Float[Tensor, "width channels"]) -> Tensor:
-        """The normal equations' matrix times gains."""
-        return self.right_side(gain.expand(len(self.place), -1, -1).to(self.mean))
-
-    def _by_segment(self, values: Tensor) -> Tensor:
-        """Sums over the bins of each segment."""
-        total = values.new_zeros(int(self.segment.max()) + 1, *values.shape[1:])
-        return total.index_add_(0, self.segment, values)
+            return float(_WAVES[-1])
+        return float(_WAVES[int(blind[0]) - 1]) if int(blind[0]) else 0.0
 
 
 @dataclass(frozen=True)
@@ -156,43 +178,6 @@ class WanderGains:
     def sigma(self) -> float:
         """The usual standard deviation of a gain, relative, by the two halves, and what both err by alike."""
         return math.hypot(NORMAL_OVER_MAD * float(self.halved.nanmedian()), _ALIKE)
-
-
-def _solve(means: _Means) -> Float[Tensor, "width channels"]:
-    """The gains' logarithms by least squares, the object's pattern eliminated; NaN where seen at too few places."""
-    gain = _conjugate_gradients(means, means.right_side(means.mean))
-    seen = (means.weight > 0).sum(0) >= _FEWEST
-    return gain.masked_fill(~seen[:, None], torch.nan)
-
-
-def _conjugate_gradients(equations: _Means, right: Tensor) -> Tensor:
-    """Solve the normal equations, each colour by itself, as far as a few rounds go: what is observed settles first."""
-    inverse = 1 / equations.weight.double().sum(0).clamp(min=1.0)[:, None]
-    gain, left = torch.zeros_like(right), right
-    step = inverse * left
-    size = first = (left * step).sum(0)
-    for _ in range(_ROUNDS):
-        applied = equations.applied(step)
-        bend = (step * applied).sum(0)
-        settled = (size <= _SETTLED * first) | (bend <= 0)
-        if bool(settled.all()):
-            break
-        length = torch.where(settled, 0.0, size / bend.clamp(min=torch.finfo(bend.dtype).tiny))
-        gain, left = gain + length * step, left - length * applied
-        after = (left * inverse * left).sum(0)
-        step, size = inverse * left + torch.where(settled, 0.0, after / size.clamp(min=1e-300)) * step, after
-    return gain
-
-
-def _shifted(values: Float[Tensor, "bins width channels"], by: Float[Tensor, " bins"]) -> Tensor:
-    """Values of every bin at columns u + by, linear between columns; those at the ends come round."""
-    first = by.floor()
-    share = (by - first)[:, None, None].to(values)
-    columns = torch.arange(values.shape[1])[None] + first.long()[:, None]
-    here, after = (
-        values.gather(1, (columns + step).remainder(values.shape[1])[..., None].expand_as(values)) for step in (0, 1)
-    )
-    return torch.lerp(here, after, share)
 
 
 def _without_long(log_gain: Tensor, longest_px: float) -> Tensor:

@@ -1,6 +1,7 @@
 """Boards in images: the order of the corners, their position, and reading by line ranges."""
 
 import dataclasses
+import functools
 import json
 import math
 from pathlib import Path
@@ -18,12 +19,14 @@ from lsvision.image.board.refine import refine_grid
 from lsvision.image.brightness import gray
 from lsvision.io import read_scan
 from lsvision.types import Board, TensorImage
+from tests.combinations import crossed
 
 ASYMMETRIC = Board(6, 5, 20.0)  # like the GP400: X from two black corner squares to two white ones
 SIDE = 16  # pixels of a square
 MARGIN = 24
 
 
+@functools.cache
 def drawn_board(board: Board) -> tuple[Tensor, Tensor]:
     """A grey board, uint8 ``(lines, width, 1)``, with its X along the columns, and its corners (u, v) in board order.
 
@@ -149,8 +152,7 @@ def test_smear_glare_and_dirt_cost_only_their_corners():
     assert error.abs().max() < 0.05
 
 
-@pytest.mark.parametrize("yaw", [0.0, 37.0, 105.0, 200.0, 345.0])
-@pytest.mark.parametrize("stretch", [0.5, 1.0, 2.0])
+@crossed("stretch yaw", [0.5, 1.0, 2.0], [0.0, 37.0, 105.0, 200.0, 345.0])
 def test_any_angle_shear_and_stretch(stretch, yaw):
     board = Board(12, 9, 30.0)
     image, corners = drawn_board(board)
@@ -220,7 +222,7 @@ def test_a_long_image_is_read_in_parts():
     assert sum(counted.reads) < 4000 + 3 * 600
 
 
-@pytest.mark.parametrize("name", ["tilt_a", "tilt_b", "tilt_c", "tilt_d"])
+@pytest.mark.parametrize("name", ["tilt_a", *(pytest.param(f"tilt_{name}", marks=pytest.mark.slow) for name in "bcd")])
 def test_boards_of_another_renderer(shared_data: Path, name: str):
     scan = read_scan(shared_data / "scans_other_renderer" / name)
     board = Board(12, 9, 30.0)

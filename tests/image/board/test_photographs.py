@@ -12,6 +12,7 @@ import torch
 from lsvision.image.board.detect import detect_board
 from lsvision.image.board.refine import DetectedCorners
 from lsvision.types import Board, TensorImage
+from tests.combinations import crossed
 
 BOARD = Board(10, 7, 30.0)
 PRECISELY = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 200, 1e-9)
@@ -48,8 +49,7 @@ def test_stereo_baseline_of_opencvs_photographs(shared_data: Path):
     assert (np.abs(baseline - after["T_mm"]) <= after["T_err_3sigma"]).all(), baseline
 
 
-@pytest.mark.parametrize("name", ["left01", "right05", "left13"])
-@pytest.mark.parametrize("side", ["left", "right", "top", "bottom"])
+@crossed("name side", ["left01", "right05", "left13"], ["left", "right", "top", "bottom"])
 def test_boards_cut_off_by_the_rim_of_a_photograph(shared_data: Path, name: str, side: str):
     folder = shared_data / "checkerboard_opencv_stereo"
     whole = corners_of(folder, f"{name}.jpg").position

@@ -8,16 +8,16 @@ import torch
 
 from lsvision.geometry import project, scan_position, transform
 from lsvision.stages.corners.edges import find_edges
-from lsvision.stages.corners.find import find_corners, locate_in_images, measure_corners
+from lsvision.stages.corners.find import measure_corners
 from lsvision.types import RawCamera, RawRig
-from tests.stages.other_renderer import raw_scan, true_motion, true_pose
-from tests.stages.rendered import BOARD, depth_scan, simulation, stereo_scan
+from tests.stages.other_renderer import raw_located, raw_scan, true_motion, true_pose
+from tests.stages.rendered import BOARD, depth_corners, depth_scan, simulation, stereo_corners, stereo_scan
 
 
 def test_edges_lie_on_their_board_within_their_sigma() -> None:
     source = simulation()
     scan = stereo_scan(source)
-    corners = find_corners(scan, BOARD)
+    corners = stereo_corners(source)
     edges = find_edges(scan, BOARD, corners)
     assert edges is not None
     assert len(edges.line) > 1000
@@ -41,15 +41,15 @@ def test_edges_lie_on_their_board_within_their_sigma() -> None:
 
 def test_a_depth_map_shows_no_edges() -> None:
     scan = depth_scan(simulation())
-    assert find_edges(scan, BOARD, find_corners(scan, BOARD)) is None
+    assert find_edges(scan, BOARD, depth_corners(simulation())) is None
 
 
-@pytest.mark.parametrize("name", ["raw_a", "raw_e"])
+@pytest.mark.parametrize("name", ["raw_a", pytest.param("raw_e", marks=pytest.mark.slow)])
 def test_edges_of_another_renderers_raw_images(shared_data: Path, name: str) -> None:
     """Cameras that are turned, distorted, and look at planes up to a millimetre apart."""
     scan = raw_scan(shared_data, name)
     n = true_motion(scan)
-    corners = measure_corners(scan, BOARD, locate_in_images(scan, BOARD), n=n)
+    corners = measure_corners(scan, BOARD, raw_located(shared_data, name), n=n)
     edges = find_edges(scan, BOARD, corners, n)
     assert edges is not None
     assert len(edges.line) > 2000
@@ -72,7 +72,7 @@ def test_edges_of_raw_cameras_without_turn_and_distortion_are_those_of_the_pair(
         RawCamera(rig.focal_length_mm, rig.principal_left_px, 0.0, (0.0, 1e-12)),
         RawCamera(rig.focal_length_mm, rig.principal_right_px),
     )  # fmt: skip
-    corners = find_corners(scan, BOARD)
+    corners = stereo_corners(simulation())
     one = find_edges(scan, BOARD, corners)
     other = find_edges(dataclasses.replace(scan, raw_rig=raw), BOARD, corners)
     assert one is not None

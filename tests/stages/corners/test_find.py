@@ -16,7 +16,17 @@ from lsvision.stages.corners.find import _triangulated, find_corners
 from lsvision.stages.corners.rows import row_difference
 from lsvision.types import DepthView, Scan, StereoPair, TensorImage, Travel
 from tests.stages.other_renderer import tilt_corners, tilt_scans, true_points
-from tests.stages.rendered import BOARD, PITCH, SMALL_RIG, depth_scan, simulation, stereo_scan, true_measurement
+from tests.stages.rendered import (
+    BOARD,
+    PITCH,
+    SMALL_RIG,
+    depth_corners,
+    depth_scan,
+    simulation,
+    stereo_corners,
+    stereo_scan,
+    true_measurement,
+)
 
 
 def rms(error: torch.Tensor) -> torch.Tensor:
@@ -122,7 +132,7 @@ def test_covariance_agrees_with_monte_carlo(transport):
 def test_rendered_boards_fit_their_truth(case):
     encoder = EncoderConfig(enabled=True, wobble_mm=1.0) if case == "encoder" else None
     source = simulation(transport="reverse" if case == "reverse" else "forward", encoder=encoder)
-    corners = find_corners(stereo_scan(source), BOARD)
+    corners = stereo_corners(source)
     assert corners.valid.all()
     left, right = source.corners()
     assert rms(corners.left_px - left).max() < 0.03
@@ -133,7 +143,7 @@ def test_rendered_boards_fit_their_truth(case):
 
 def test_depth_maps_agree_with_two_images():
     source = simulation()
-    stereo, mapped = find_corners(stereo_scan(source), BOARD), find_corners(depth_scan(source), BOARD)
+    stereo, mapped = stereo_corners(source), depth_corners(source)
     assert mapped.right_px is None
     assert mapped.valid.all()
     error = mapped.points - true_measurement(source)
@@ -144,7 +154,7 @@ def test_depth_maps_agree_with_two_images():
 
 def test_covariance_of_an_exact_depth_map_covers_the_error_of_the_corner():
     source = simulation()
-    corners = find_corners(depth_scan(source), BOARD)
+    corners = depth_corners(source)
     error = corners.points - true_measurement(source)
     ratio = rms(error) / corners.covariance.diagonal(dim1=-2, dim2=-1).mean(0).sqrt()
     assert (ratio < 2).all()

@@ -12,13 +12,13 @@ from lsvision.stages.calibration.config import CalibrationConfig
 from lsvision.stages.corners.find import locate_in_images, measure_corners
 from lsvision.stages.corners.rows import row_difference
 from lsvision.types import RawCamera, RawRig
-from tests.stages.other_renderer import raw_scan, raw_scans, true_motion, true_points
-from tests.stages.rendered import BOARD, FULL_RIG, simulation, stereo_scan
+from tests.stages.other_renderer import raw_located, raw_scan, raw_scans, true_motion, true_points
+from tests.stages.rendered import BOARD, FULL_RIG, located, simulation, stereo_scan
 
 
 def test_corners_of_another_renderers_raw_images(shared_data: Path):
     scan = raw_scan(shared_data, "raw_a")
-    located = locate_in_images(scan, BOARD)
+    located = raw_located(shared_data, "raw_a")
     nominal = measure_corners(scan, BOARD, located)
     corners = measure_corners(scan, BOARD, located, n=true_motion(scan))
     assert corners.valid.all()
@@ -34,9 +34,9 @@ def test_corners_of_another_renderers_raw_images(shared_data: Path):
 @pytest.mark.slow
 def test_joint_calibration_of_another_renderers_raw_scans(shared_data: Path):
     scans = raw_scans(shared_data)
-    located, n = [locate_in_images(scan, BOARD) for scan in scans], None
+    seen, n = [locate_in_images(scan, BOARD) for scan in scans], None
     for _ in range(2):
-        boards = [measure_corners(scan, BOARD, found, n=n) for scan, found in zip(scans, located, strict=True)]
+        boards = [measure_corners(scan, BOARD, found, n=n) for scan, found in zip(scans, seen, strict=True)]
         calibration = calibrate(boards, scans[0].rig, CalibrationConfig())
         n = calibration.motion.n
     error = (n - true_motion(scans[0])) / calibration.motion.sigma
@@ -50,14 +50,13 @@ def test_joint_calibration_of_another_renderers_raw_scans(shared_data: Path):
 
 
 def test_raw_cameras_without_turn_and_distortion_give_the_same_bits():
-    scan = stereo_scan(simulation())
+    scan, found = stereo_scan(simulation()), located(simulation())
     rig = scaled_rig(FULL_RIG, 16)
     raw = RawRig(
         rig.width_px, rig.pixel_pitch_um, rig.baseline_mm,
         RawCamera(rig.focal_length_mm, rig.principal_left_px), RawCamera(rig.focal_length_mm, rig.principal_right_px),
     )  # fmt: skip
-    located = locate_in_images(scan, BOARD)
-    one, other = (measure_corners(each, BOARD, located) for each in (scan, dataclasses.replace(scan, raw_rig=raw)))
+    one, other = (measure_corners(each, BOARD, found) for each in (scan, dataclasses.replace(scan, raw_rig=raw)))
     for field in ("points", "left_px", "right_px"):
         torch.testing.assert_close(getattr(one, field), getattr(other, field), rtol=0, atol=0, equal_nan=True)
     # The last bit of products of matrices depends on where they lie in memory.

@@ -43,7 +43,7 @@ def shadow(image: Tensor, corner: Tensor) -> Tensor:
 @pytest.mark.parametrize(
     "in_both", [pytest.param(True, marks=pytest.mark.slow, id="both"), pytest.param(False, id="one")]
 )
-@pytest.mark.parametrize("spoil", [clamp, finger, glare, shadow])
+@pytest.mark.parametrize("spoil", [pytest.param(clamp, marks=pytest.mark.slow), finger, glare, shadow])
 def test_what_is_left_is_right(spoil, in_both):
     source = simulation(SceneConfig(pitch_deg=5.0, roll_deg=-4.0, yaw_deg=14.0))
     scan = stereo_scan(source)

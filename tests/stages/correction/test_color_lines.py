@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -9,12 +10,21 @@ import pytest
 import torch
 from torch import Tensor
 
-from lsvision.simulation import Acquisition, EncoderConfig, MotionConfig, SceneConfig, SensorConfig, simulate
+from lsvision.simulation import (
+    Acquisition,
+    EncoderConfig,
+    MotionConfig,
+    SceneConfig,
+    SensorConfig,
+    Simulation,
+    simulate,
+)
 from lsvision.stages.correction.config import CorrectionConfig
 from lsvision.stages.correction.correct import correct_scan
 from lsvision.stages.disparity.depth import depth_of
-from lsvision.types import Motion
-from tests.stages.rendered import BOARD, PITCH, SMALL_RIG, depth_scan
+from lsvision.types import DepthView, Motion, Rig, Scan, TensorImage, Transport
+from tests.combinations import crossed
+from tests.stages.rendered import BOARD, PITCH, SMALL_RIG
 
 MOTION = MotionConfig(angle_x_deg=-2.0, angle_z_deg=2.0, stretch=1.07)
 CONFIG = CorrectionConfig(height_range_mm=(-30.0, 30.0), strip_rows=1000)
@@ -27,27 +37,38 @@ def product(
     spacing: float,
     *,
     registered: bool,
-    transport: str,
+    transport: Transport,
     encoder: EncoderConfig | None,
     corrected: bool = True,
     offset_mm: float = 0.0,
 ):
     """Colours of a sheet seen by a sensor whose red and blue lines look ``spacing`` lines before and after green."""
     rig = dataclasses.replace(SMALL_RIG, color_spacing_lines=(-spacing, 0.0, spacing))
-    sensor = SensorConfig(supersampling=2, noise=0.0, color_registered=registered)
-    sheet = SceneConfig(kind="sheet", yaw_deg=3.0, depth_offset_mm=offset_mm)
-    source = simulate(rig, BOARD, sheet, MOTION, sensor, Acquisition(PITCH, transport=transport, encoder=encoder))
-    scan = dataclasses.replace(depth_scan(source), color_registered=registered)
-    if not corrected:
-        scan = dataclasses.replace(scan, rig=SMALL_RIG)
+    source = seen(rig, transport, encoder, offset_mm, registered=registered)
+    images = DepthView(TensorImage(torch.cat(list(source.strips("left")))), depth_map(transport, encoder, offset_mm))
+    scan = Scan(Path("sheet"), rig if corrected else SMALL_RIG, source.travel, images, color_registered=registered)
     motion = Motion(source.trajectory.n, torch.zeros(3, 3).double())
     (strip,) = correct_scan(scan, depth_of(scan), motion, CONFIG)
     assert bool(strip.valid[PATCH].all())
     return strip.color[PATCH].to(torch.float32)
 
 
+def seen(
+    rig: Rig, transport: Transport, encoder: EncoderConfig | None, offset_mm: float, *, registered: bool = False
+) -> Simulation:
+    sensor = SensorConfig(supersampling=2, noise=0.0, color_registered=registered)
+    sheet = SceneConfig(kind="sheet", yaw_deg=3.0, depth_offset_mm=offset_mm)
+    return simulate(rig, BOARD, sheet, MOTION, sensor, Acquisition(PITCH, transport=transport, encoder=encoder))
+
+
 @functools.cache
-def truth_of(transport: str, encoder: EncoderConfig | None, offset_mm: float = 0.0) -> Tensor:
+def depth_map(transport: Transport, encoder: EncoderConfig | None, offset_mm: float) -> TensorImage:
+    """The same whatever lines the colours lie on."""
+    return TensorImage(torch.cat(list(seen(SMALL_RIG, transport, encoder, offset_mm).depth_strips()))[..., None])
+
+
+@functools.cache
+def truth_of(transport: Transport, encoder: EncoderConfig | None, offset_mm: float = 0.0) -> Tensor:
     """Colours that a sensor sees all at once: registered or not is the same."""
     return product(0.0, registered=False, transport=transport, encoder=encoder, offset_mm=offset_mm)
 
@@ -66,10 +87,8 @@ def shift_along(image: Tensor, truth: Tensor) -> float:
     return -total
 
 
-@pytest.mark.parametrize("encoder", [None, WOBBLE], ids=["constant", "encoder"])
-@pytest.mark.parametrize("transport", ["forward", "reverse"])
-@pytest.mark.parametrize("registered", [False, True], ids=["raw", "registered"])
-def test_red_and_blue_meet(registered: bool, transport: str, encoder: EncoderConfig | None) -> None:
+@crossed("registered transport encoder", [False, True], ["forward", "reverse"], [None, WOBBLE])
+def test_red_and_blue_meet(registered: bool, transport: Transport, encoder: EncoderConfig | None) -> None:
     options = {"registered": registered, "transport": transport, "encoder": encoder}
     truth = truth_of(transport, encoder)
     trilinear = product(APART / 2, **options)

@@ -1,6 +1,7 @@
 """Disparity and depth of strips: the search range, reads of any range, and the height of a rendered plane."""
 
 import dataclasses
+import functools
 import math
 from pathlib import Path
 
@@ -37,6 +38,18 @@ def sheet():
     return source, stereo_scan(source)
 
 
+@pytest.fixture(scope="module")
+def untiled(sheet):
+    """The sheet's depth from its whole images at once."""
+
+    @functools.cache
+    def measured(config: DisparityConfig) -> torch.Tensor:
+        left, right = (image.read(0, sheet[1].lines) for image in (sheet[1].left, sheet[1].images.right))
+        return depth_at(SMALL_RIG, measure_strip(left, right, SMALL_RIG, config).disparity)
+
+    return measured
+
+
 def test_default_range_is_that_of_the_camera():
     low, high = disparity_range(FULL_RIG, DisparityConfig())
     assert abs(low + 165) <= 1
@@ -57,12 +70,11 @@ def test_depth_equals_triangulation_pixel_by_pixel():
 
 @pytest.mark.parametrize("config", [CONFIG, FINE])
 @pytest.mark.parametrize("strip_lines", [64, 100, 257, 10_000])
-def test_strips_of_any_height_and_the_whole_are_equal(sheet, config, strip_lines):
-    left, right = sheet[1].left.read(0, sheet[1].lines), sheet[1].images.right.read(0, sheet[1].lines)
-    untiled = depth_at(SMALL_RIG, measure_strip(left, right, SMALL_RIG, config).disparity)
+def test_strips_of_any_height_and_the_whole_are_equal(sheet, untiled, config, strip_lines):
+    lines = sheet[1].lines
     tiled = MatchedDepth(sheet[1].images, sheet[1].rig, dataclasses.replace(config, strip_lines=strip_lines))
-    parts = [tiled.read(start, min(start + strip_lines, len(left))).z for start in range(0, len(left), strip_lines)]
-    assert torch.cat(parts).numpy().tobytes() == untiled.numpy().tobytes()
+    parts = [tiled.read(start, min(start + strip_lines, lines)).z for start in range(0, lines, strip_lines)]
+    assert torch.cat(parts).numpy().tobytes() == untiled(config).numpy().tobytes()
 
 
 @pytest.mark.parametrize("config", [CONFIG, FINE])

@@ -10,7 +10,7 @@ from torch import Tensor
 from lsvision.errors import ResponseError
 from lsvision.stages.response.archive import response_of_scans
 from lsvision.stages.response.config import ResponseConfig
-from lsvision.stages.response.wander import WanderGains, WanderSums, _Means, _without_long
+from lsvision.stages.response.wander import WanderGains, WanderSums, _without_long
 
 WIDTH = 300
 
@@ -53,9 +53,10 @@ def test_fine_gains_come_back_within_one_percent_with_honest_sigma(rms):
 def test_waves_that_are_observed_by_hand():
     """Of a wander that is uniform over ±5 px, φ = sin(5k) / 5k: 1 - φ² = 0.1 at 5k = 0.551."""
 
-    def of(place: Tensor) -> _Means:
-        mean, weight = torch.zeros(len(place), 10, 1), torch.ones(len(place), 10)
-        return _Means(mean, weight, place, torch.zeros(len(place), dtype=torch.int64))
+    def of(wander: Tensor) -> WanderGains:
+        sums = WanderSums()
+        sums.add(torch.ones(len(wander), 10, 1), torch.ones(len(wander), 10, dtype=torch.bool), wander, 0)
+        return sums.gains()
 
     assert of(torch.arange(-10, 11) * 0.5).observed_px == pytest.approx(2 * math.pi * 5.24 / 0.551, rel=0.03)
     assert of(torch.zeros(1)).observed_px == 0.0

@@ -21,7 +21,7 @@ from lsvision.stages.calibration.along_scan.parameters import Scores, climbed, l
 from lsvision.stages.calibration.along_scan.search import FoundErrors, evidence_by_component, evidence_of
 from lsvision.stages.calibration.along_scan.spectrum import Spectrum
 from lsvision.stages.calibration.along_scan.variances import as_large_as_probable, stepped
-from lsvision.stages.calibration.along_scan.waves import with_waves
+from lsvision.stages.calibration.along_scan.waves import of_all, of_waves, with_waves
 from lsvision.stages.calibration.problem import BoardProblem
 
 _STEPS, _STEPS_NEARBY = 30, 10
@@ -71,10 +71,10 @@ def _most_probable(equations: NormalEquations) -> Spectrum:
     count = len(kernel_family(FINE).log_prior)
     kernels = stepped(equations, Spectrum.of_kernels((usual / count).expand(-1, count)), _STEPS, _STEPS - _CAREFUL)
     best = with_waves(equations, kernels)
-    value = log_probability(equations, best, count)
+    value = of_waves(equations, best) if best.waves else of_all(equations, best)
     if evidence_of(equations, kernels.covariance(FINE)) > value:
         kernels = stepped(equations, kernels, _STEPS, _STEPS)
-        value, best = max((value, best), (log_probability(equations, kernels, count), kernels), key=_first)
+        value, best = max((value, best), (of_all(equations, kernels), kernels), key=_first)
     together = torch.zeros_like(kernels.variances)
     together[:, :BROAD] = usual / BROAD
     broad = stepped(equations, Spectrum.of_kernels(together), _STEPS_BROAD, _STEPS_BROAD - _CAREFUL)
