@@ -38,7 +38,8 @@ class BoardCorners:
     theirs, mm². A corner with ``valid`` false was not seen; its point is NaN. ``left_px`` and ``right_px`` are where
     both images show them, (column, line); of a raw rig, the images of its ideal pair.
     ``travel_mm`` is the travel of every line of the scan, where that is known. ``by_rig`` is how far points are off,
-    mm, by each of the independent errors of a raw rig, of one sigma, which all its scans share.
+    mm, by each of the independent errors of a raw rig, of one sigma, which all its scans share. ``later_mm`` is the
+    travel after which the right camera of a raw rig saw the corner; None where both see it at once.
     """
 
     scan: str
@@ -50,6 +51,7 @@ class BoardCorners:
     right_px: Float[Tensor, "corners 2"] | None = None
     travel_mm: Float[Tensor, " lines"] | None = None
     by_rig: Float[Tensor, "corners 3 modes"] | None = None
+    later_mm: Float[Tensor, " corners"] | None = None
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,13 @@
 import pytest
 import torch
 
-from lsvision.estimation import BorderedState, bordered_least_squares, levenberg_marquardt, shared_information
+from lsvision.estimation import (
+    BorderedState,
+    block_rows,
+    bordered_least_squares,
+    levenberg_marquardt,
+    shared_information,
+)
 
 BLOCKS, ROWS, SHARED, OWN = 5, 12, 3, 2
 
@@ -42,6 +48,17 @@ def test_minimum_and_covariance_are_those_of_one_vector():
     assert torch.allclose(both, oracle.state, rtol=0, atol=1e-7)
     covariance = (oracle.factor @ oracle.factor.mT)[:SHARED, :SHARED]
     assert torch.allclose(found.factor @ found.factor.mT, covariance, rtol=1e-6, atol=0)
+
+
+def test_rows_are_derivatives_and_residuals():
+    residual, start = problem()
+    rows = block_rows(residual, start)
+    torch.testing.assert_close(rows[..., -1], residual(start))
+    for column in range(OWN + SHARED):
+        step = torch.zeros(OWN + SHARED).double()
+        step[column] = 1e-6
+        moved = BorderedState(start.shared + step[OWN:], start.own + step[:OWN])
+        torch.testing.assert_close(rows[..., column], (residual(moved) - residual(start)) / 1e-6, rtol=0, atol=1e-5)
 
 
 def test_a_problem_gives_the_same_alone_and_in_a_batch():

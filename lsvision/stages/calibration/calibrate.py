@@ -11,6 +11,7 @@ from torch import Tensor
 from lsvision.errors import CalibrationError
 from lsvision.estimation import Info
 from lsvision.geometry import sharp_depth_mm
+from lsvision.stages.calibration.along_scan.seen_later import SeenLater
 from lsvision.stages.calibration.batch import BatchCalibration, errors_along_scan_of, iterations_of
 from lsvision.stages.calibration.config import CalibrationConfig
 from lsvision.stages.calibration.exchanged import images_exchanged
@@ -50,7 +51,7 @@ def calibrate(
             covariances that are not finite or not positive definite (names the scan); no solution.
         ConfigError: a mounting pitch is given for more than one board.
     """
-    found = _explained(boards, edges, config)
+    found = _explained(boards, edges, rig, config)
     solution, findings = found.solution, found.findings
     batch, scale = solution.summary(), float(solution.noise_scale)
     if int(batch.info) == Info.SINGULAR:
@@ -101,7 +102,7 @@ class _Explained:
 
 
 def _explained(
-    boards: Sequence[BoardCorners], edges: Sequence[BoardEdges | None] | None, config: CalibrationConfig
+    boards: Sequence[BoardCorners], edges: Sequence[BoardEdges | None] | None, rig: Rig, config: CalibrationConfig
 ) -> _Explained:
     """Solve, with errors along the scan only where no other cause explains the residuals, then with the edges."""
     measured = _sound(boards)
@@ -114,7 +115,7 @@ def _explained(
         shaken = bool(solution.along_scan.found)
     if not shaken or edges is None or not config.corrects_lines:
         return _Explained(solution, findings)
-    by_edges = with_edges(solution, edges)
+    by_edges = with_edges(solution, edges, SeenLater.of(boards, rig))
     return _Explained(by_edges, findings, _what_edges_did(solution, by_edges))
 
 

@@ -42,5 +42,6 @@ def _moved_nominally(corners: BoardCorners, n: Tensor) -> BoardCorners:
         corners,
         points=displace(corners.points, n),
         covariance=matrix @ corners.covariance @ matrix.mT,
+        later_mm=None if corners.later_mm is None else corners.later_mm * n[1],
         travel_mm=None if corners.travel_mm is None else corners.travel_mm * n[1],
     )

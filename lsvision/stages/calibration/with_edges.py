@@ -2,7 +2,8 @@
 
 Corners show a vibration at their rows alone. Where the residuals of the corners give evidence for errors along the
 scan, the edges between them show these on every line; corners, edges, poses, n and the processes are then one problem.
-Its corners and its edges each have noise as large as their own residuals say.
+Its corners and its edges each have noise as large as their own residuals say. Corners that the motion displaced from
+where their lines would show them, in their windows and between the moments of two cameras, are set right by it.
 """
 
 from collections.abc import Sequence
@@ -27,6 +28,7 @@ from lsvision.stages.calibration.along_scan import (
 )
 from lsvision.stages.calibration.along_scan.kernels import wave_length
 from lsvision.stages.calibration.along_scan.lines import Travel
+from lsvision.stages.calibration.along_scan.seen_later import SeenLater
 from lsvision.stages.calibration.along_scan.windows import Windows
 from lsvision.stages.calibration.model import refitted, residuals_in_sigmas
 from lsvision.stages.calibration.problem import BoardProblem
@@ -40,8 +42,11 @@ _DOUBTED = 25.0
 _ROUNDS = 2
 
 
-def with_edges(solution: Solution, edges: Sequence[BoardEdges | None]) -> Solution:
+def with_edges(solution: Solution, edges: Sequence[BoardEdges | None], later: SeenLater | None = None) -> Solution:
     """The solution of one problem, in which errors along the scans were found, with edges of its boards.
+
+    Args:
+        later: when the right camera saw the corners; at once with the left one if None.
 
     Returns:
         The given one where no edges were found.
@@ -52,7 +57,7 @@ def with_edges(solution: Solution, edges: Sequence[BoardEdges | None]) -> Soluti
     scale = torch.full_like(solution.noise_scale, _DOUBTED)
     found = _estimated(replace(solution, noise_scale=scale), rows)
     for _ in range(_ROUNDS):
-        problem = _unbent(solution.problem, found)
+        problem = _unbent(solution.problem, found, later)
         scale = _noise_scale(problem, found)
         found = _estimated(replace(found, problem=problem, noise_scale=scale), rows)
     whitened = residuals_in_sigmas(found.steadied, found.posterior.mean) / scale.sqrt()
@@ -90,12 +95,18 @@ def _estimated(solution: Solution, edges: EdgeRows) -> Solution:
     )
 
 
-def _unbent(problem: BoardProblem, found: Solution) -> BoardProblem:
-    """A problem whose corners lie where they would if a vibration had not bent the edges in their windows."""
+def _unbent(problem: BoardProblem, found: Solution, later: SeenLater | None) -> BoardProblem:
+    """A problem whose corners lie where they would if a vibration had not bent the edges in their windows.
+
+    And if both cameras had seen them at the same moment.
+    """
     windows, travel = Windows.of(problem, found.posterior.mean), Travel.of(problem)
     end = travel.start_mm + travel.extent_mm
     reach = torch.stack([travel.start_mm - windows.spacing_mm / 2, end + windows.spacing_mm / 2], dim=-1)
     processes = found.processes((), reach)
+    if later is not None:
+        off = torch.where(problem.valid[..., None], later.off(processes, problem.points), 0.0)
+        problem = replace(problem, points=problem.points - off)
     moved = torch.where(problem.valid[..., None], processes.displaced(problem.points), 0.0)
     steadied = replace(problem, points=problem.points - moved)
     off = windows.off(processes, problem, residuals_in_sigmas(steadied, found.posterior.mean))

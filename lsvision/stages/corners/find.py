@@ -37,6 +37,7 @@ class _Measured:
     left_px: Tensor
     right_px: Tensor | None = None
     by_rig: Tensor | None = None
+    later_mm: Tensor | None = None
 
 
 @dataclass(frozen=True)
@@ -113,6 +114,7 @@ def measure_corners(
         right_px=measured.right_px,
         travel_mm=travel_at(scan.travel, torch.arange(scan.lines, dtype=torch.float64)),
         by_rig=None if measured.by_rig is None else torch.where(valid[:, None, None], measured.by_rig, torch.nan),
+        later_mm=None if measured.later_mm is None else torch.where(valid, measured.later_mm, torch.nan),
     )
 
 
@@ -170,7 +172,8 @@ def _triangulated(
     covariance = covariance + mixed + mixed.mT
     n = points.new_tensor([0.0, 1.0, 0.0]) if rectification is None else rectification.n
     by_rig = points_by_rig(scan, left.position, right.position, weight, n)
-    return _Measured(points, covariance, valid & torch.isfinite(points).all(-1), ideal.left, ideal.right, by_rig)
+    valid &= torch.isfinite(points).all(-1)
+    return _Measured(points, covariance, valid, ideal.left, ideal.right, by_rig, ideal.later_mm)
 
 
 def _lines_out_of_step(ideal: IdealCorners, seen: Tensor) -> float:

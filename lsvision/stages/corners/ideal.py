@@ -17,12 +17,16 @@ from lsvision.types import Travel
 
 @dataclass(frozen=True)
 class IdealCorners:
-    """Places (column, line) of corners in both ideal images, and how fast an ideal column grows with a raw one."""
+    """Places (column, line) of corners in both ideal images, and how fast an ideal column grows with a raw one.
+
+    ``later_mm`` is the travel after which the right camera saw each; None where both see it at once.
+    """
 
     left: Float[Tensor, "corners 2"]
     right: Float[Tensor, "corners 2"]
     left_growth: Float[Tensor, " corners"]
     right_growth: Float[Tensor, " corners"]
+    later_mm: Float[Tensor, " corners"] | None = None
 
     @classmethod
     def of(
@@ -43,6 +47,7 @@ class IdealCorners:
             torch.stack([columns[1], right_line], dim=-1),
             rectification.growth(left[:, 0], "left"),
             rectification.growth(right[:, 0], "right"),
+            met.later_mm if bool(rectification.raw.plane.any()) else None,
         )
 
 

@@ -22,7 +22,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from lsvision.estimation import BorderedState, block_rows
-from lsvision.stages.calibration.along_scan import FINE, Lever, NormalEquations, Travel
+from lsvision.stages.calibration.along_scan import COMPONENTS, FINE, Lever, NormalEquations, Spectrum, Travel
+from lsvision.stages.calibration.along_scan.kernels import kernel_family
 from lsvision.stages.rig.model import SHARED
 from lsvision.stages.rig.seen_motion import SeenMotion
 from lsvision.stages.rig.sightings import Sightings
@@ -30,6 +31,7 @@ from lsvision.stages.rig.solve import RigSolution, corner_residuals
 
 LARGEST_SHARE = 0.5
 """Of the corners' spacing, that a window reaches to either side of its corner."""
+_SMOOTH = 3  # of the kernels, the one whose length is an eighth of the travel
 _NODES = 6  # of the mean over a window
 
 
@@ -96,14 +98,14 @@ class LineRows:
         kept, shared = self.solution.sightings.valid, self.solution.found.state.shared
         return NormalEquations.of_rows(
             by_knot=self.by_knots(kept, share).flatten(-2),
-            by_state=self._by_state,
+            by_state=self.by_state,
             prior=torch.cat([torch.eye(SHARED, dtype=shared.dtype), -shared[:, None]], dim=-1),
             values=4.0 * float(kept.sum()),
             rms_mm=self._rms_mm(kept),
         )
 
     @cached_property
-    def _by_state(self) -> Float[Tensor, "boards rows columns"]:
+    def by_state(self) -> Float[Tensor, "boards rows columns"]:
         """Rows of the solution's corners on the pose, on rig and motion, and their residuals."""
         kept, model = self.solution.sightings, self.solution.model
 
@@ -112,6 +114,12 @@ class LineRows:
 
         rows = block_rows(residuals, self.solution.found.state)
         return torch.cat([-rows[..., :-1], rows[..., -1:]], dim=-1)
+
+    def any_motion(self) -> Spectrum:
+        """A spectrum of smooth motion, as long as a few rows of corners, that is as large as all residuals."""
+        variances = self.residuals.new_zeros(len(COMPONENTS), len(kernel_family(FINE).log_prior))
+        variances[:, _SMOOTH] = self._rms_mm(self.solution.sightings.valid).square()
+        return Spectrum.of_kernels(variances)
 
     def _weights(self, share: float) -> Float[Tensor, "boards corners 2 edges knots"]:
         """Weights of the knots in the means over windows."""

@@ -36,6 +36,8 @@ from lsvision.stages.rig.solve import (
 from lsvision.types import ErrorAlongScan
 
 _WINDOWS = 11  # sizes tried
+_REJECTIONS = 6
+_FREE = 10.0  # sigmas of the prior, mm and rad: of rig, motion and poses where outliers are looked for
 _NOTICED = 1.02  # scale of the noise from which the corners are weighed anew
 _SUSPECT = 1.2  # noise scale from which lines may have moved
 _MOST_OUTLIERS = 0.02  # of the corners: more were left out because a model without motion does not fit
@@ -64,7 +66,7 @@ def allow_for_line_motion(solution: RigSolution, sightings: Sightings, config: R
     by_points = solve(_measured(now), options)
     if not bool(by_points.along_scan.found):
         return ShakenSolution(solution, ())
-    now = _keeping(now, sightings, now.sightings.valid & by_points.problem.valid)
+    now = _keeping(now, sightings, _without_outliers(now, sightings, config))
     found = _Found.of(LineRows.of(now, sightings), config)
     now = _keeping(found.solution, sightings, found.not_off(sightings, config))
     found = _Found.of(LineRows.of(now, sightings), config, found)
@@ -104,12 +106,45 @@ class _Found:
     def not_off(self, sightings: Sightings, config: RigConfig) -> Bool[Tensor, "boards corners"]:
         """Which of all corners lie where the motion of their lines puts them, as those that were kept show it."""
         lines, roots = LineRows.of(self.solution, sightings), covariance_root(self.errors.covariance(FINE))
-        kept = self.solution.sightings.valid
-        everywhere, there = (lines.by_latents(roots, which, self.window) for which in (lines.seen, kept))
-        eye = torch.eye(there.shape[-1], dtype=there.dtype)
-        latent = torch.linalg.solve(eye + there.mT @ there, there.mT @ lines.residuals.flatten(1)[..., None])
-        square = (lines.residuals - (everywhere @ latent).unflatten(1, (-1, 4))[..., 0]).square().sum(-1)
-        return near_corners(lines.seen, square.sqrt() <= config.outlier_sigma * typical_scale(square, kept))
+        unknowns = lines.by_latents(roots, lines.seen, self.window)
+        return _near_others(lines, unknowns, self.solution.sightings.valid, config)
+
+
+def _without_outliers(solution: RigSolution, sightings: Sightings, config: RigConfig) -> Bool[Tensor, "boards corners"]:
+    """Which of all corners lie where the others put them, under any smooth motion of the lines, pose and rig.
+
+    The search for the motion would take what is far off for motion.
+    """
+    lines = LineRows.of(_keeping(solution, sightings, sightings.valid), sightings)
+    roots = covariance_root(lines.any_motion().covariance(FINE))
+    unknowns = torch.cat([lines.by_latents(roots, lines.seen, 0.0), _FREE * lines.by_state[..., :-1]], dim=-1)
+    kept = lines.seen
+    for _ in range(_REJECTIONS):
+        kept = _near_others(lines, unknowns, kept, config)
+    return kept
+
+
+def _near_others(
+    lines: LineRows,
+    unknowns: Float[Tensor, "boards rows latents"],
+    kept: Bool[Tensor, "boards corners"],
+    config: RigConfig,
+) -> Bool[Tensor, "boards corners"]:
+    """Which of all corners lie where the other ones of those that were kept put them.
+
+    Args:
+        unknowns: rows of all corners on standard normal variables of each board.
+    """
+    by_corner = unknowns.unflatten(1, (-1, 4))
+    there = torch.where(kept[..., None, None], by_corner, 0.0).flatten(1, 2)
+    covariance = torch.linalg.inv(torch.eye(there.shape[-1], dtype=there.dtype) + there.mT @ there)
+    found = covariance @ (there.mT @ lines.residuals.flatten(1)[..., None])
+    rest = lines.residuals - (unknowns @ found)[..., 0].unflatten(1, (-1, 4))
+    shared = by_corner @ covariance[:, None] @ by_corner.mT
+    # A corner that was kept lies farther off where the others put it than where itself helped to put it.
+    variance = torch.eye(4, dtype=there.dtype) + torch.where(kept[..., None, None], -shared, shared)
+    square = (rest * torch.linalg.solve(variance, rest)).sum(-1)
+    return near_corners(lines.seen, square.sqrt() <= config.outlier_sigma * typical_scale(square, kept))
 
 
 def _likeliest_window(lines: LineRows, errors: FoundErrors) -> float:

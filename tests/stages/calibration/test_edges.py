@@ -8,7 +8,7 @@ import torch
 from torch.nn.functional import pad
 
 from lsvision.geometry import middle_point, scan_position, shaken, transform, without_trend
-from lsvision.stages.calibration.along_scan import edge_rows
+from lsvision.stages.calibration.along_scan import Travel, edge_rows
 from lsvision.stages.calibration.calibrate import calibrate
 from lsvision.stages.calibration.config import CalibrationConfig
 from lsvision.stages.calibration.problem import BoardProblem, BoardState
@@ -180,3 +180,19 @@ def test_the_right_camera_sees_a_motion_when_it_looks():
     torch.testing.assert_close(known, expected, rtol=0.1, atol=0)
     at_once = edge_rows(problem, state, [dataclasses.replace(found, later_mm=None) for found in edges]).sigma_px
     assert float((at_once / known)[:, 0].min()) > 1.3
+
+
+def test_crossings_that_the_right_camera_saw_beyond_the_knots_say_nothing():
+    """Beyond the corners no knot says what the object did."""
+    corners, motion = shaken_boards(0, TWO_TILTS)
+    problem, state = at_truth(corners)
+    edges = edges_of(corners, motion, later_mm=8.0)
+    inside, end = [], (Travel.of(problem).start_mm + Travel.of(problem).extent_mm).tolist()
+    for found, last in zip(edges, end, strict=True):
+        kept = found.points[:, 1] + found.later_mm <= last
+        values = {item.name: getattr(found, item.name) for item in dataclasses.fields(found)}
+        cut = {name: value[kept] for name, value in values.items() if isinstance(value, torch.Tensor)}
+        inside.append(dataclasses.replace(found, **cut))
+    grams = [(rows := edge_rows(problem, state, some).rows).mT @ rows for some in (edges, inside)]
+    assert sum(len(found.line) for found in inside) < sum(len(found.line) for found in edges)
+    torch.testing.assert_close(grams[0], grams[1], rtol=1e-6, atol=1e-6 * float(grams[1].abs().max()))

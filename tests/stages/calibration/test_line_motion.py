@@ -7,6 +7,7 @@ import pytest
 import torch
 from torch.nn.functional import pad
 
+from lsvision.errors import CalibrationError
 from lsvision.estimation.gaussian_process import covariance_root
 from lsvision.geometry import middle_point, shaken, steadied, without_trend
 from lsvision.stages.calibration.along_scan import Linearised, Spectrum, processes_given_corners
@@ -16,7 +17,7 @@ from lsvision.stages.calibration.calibrate import calibrate
 from lsvision.stages.calibration.config import CalibrationConfig
 from lsvision.stages.calibration.known_motion import calibrate_lines
 from lsvision.stages.calibration.methods import joint
-from lsvision.types import BoardCorners
+from lsvision.types import BoardCorners, BoardEdges
 from tests.stages.calibration.boards import FOUR_TILTS, RIG, SIGMA, Corners, simulate
 from tests.stages.calibration.test_correlated import small_problem
 
@@ -186,3 +187,23 @@ def test_lines_of_a_board_whose_motion_is_known():
     level = without_trend(boards[0].travel_mm)
     off = level(found.line_motions[0].values.T[:2]) - level(truth[0].T[:2])
     assert float(off.square().mean().sqrt()) < 0.05
+
+
+def test_a_known_motion_stretches_the_travel_between_the_cameras_of_a_raw_pair(monkeypatch):
+    """Taken to where the object moved nominally, the right camera sees an edge later by n2 times as much."""
+    corners, boards, _ = shaken_boards(5, tilts=FOUR_TILTS[1:2])
+    points = torch.rand(7, 3, dtype=torch.float64)
+    numbers, square = torch.arange(7), torch.eye(2, dtype=torch.float64).expand(7, 2, 2)
+    edges = BoardEdges("s", points, square, points[:, 0], points, points, numbers, numbers, later_mm=points[:, 1])
+    given = []
+
+    def calibrated(corners, rig, config, edges):
+        given.extend(edges)
+        raise CalibrationError("enough is known")
+
+    monkeypatch.setattr("lsvision.stages.calibration.known_motion.calibrate", calibrated)
+    for seen in (edges, dataclasses.replace(edges, later_mm=None)):
+        with pytest.raises(CalibrationError, match="enough"):
+            calibrate_lines(boards[0], seen, corners.n, RIG, CalibrationConfig())
+    torch.testing.assert_close(given[0].later_mm, corners.n[1] * edges.later_mm)
+    assert given[1].later_mm is None

@@ -13,7 +13,7 @@ from lsvision.simulation import BoardPose
 from lsvision.stages.calibration.along_scan import Linearised, Spectrum, edge_rows, search_with_edges
 from lsvision.stages.calibration.along_scan.evidence import NormalEquations
 from lsvision.stages.calibration.along_scan.kernels import FINE, KNOTS, SEARCHED, covariance_of, kernel_family
-from lsvision.stages.calibration.along_scan.lines import Travel
+from lsvision.stages.calibration.along_scan.lines import Travel, latents
 from lsvision.stages.calibration.along_scan.parameters import Scores, climbed, log_posterior, moved
 from lsvision.stages.calibration.along_scan.projected import Projected
 from lsvision.stages.calibration.along_scan.search import evidence_by_component
@@ -40,6 +40,22 @@ def setting(seed: int) -> tuple[BoardProblem, Linearised, NormalEquations]:
     linearised = Linearised.of(problem, state, prior_sigma=0.05)
     rows = edge_rows(problem, state, edges_of(corners, motion))
     return problem, linearised, NormalEquations.of(problem, linearised, FINE, rows)
+
+
+def test_rows_of_corners_have_their_normal_equations():
+    problem, linearised, _ = setting(3)
+    knots = FINE.count
+    eye = torch.eye(knots, dtype=torch.float64).expand(1, 4, -1, -1)
+    both = torch.cat([latents(problem, eye, FINE), linearised.columns], dim=-1)
+    white = torch.linalg.solve_triangular(problem.noise_chol, both, upper=False).flatten(1, 2)
+    expected = NormalEquations.of(problem, linearised, FINE)
+    values = 3.0 * float(problem.valid.sum())
+    by_knot, by_state = white.split([4 * knots, white.shape[-1] - 4 * knots], dim=-1)
+    found = NormalEquations.of_rows(by_knot, by_state, linearised.prior, values, expected.rms_mm)
+    for name in ("gram", "cross", "state"):
+        one, other = getattr(found, name), getattr(expected, name)
+        torch.testing.assert_close(one, other, rtol=1e-9, atol=1e-9 * float(other.abs().max()))
+    assert found.freedom == expected.freedom
 
 
 def some_spectrum(problem: BoardProblem) -> Spectrum:
