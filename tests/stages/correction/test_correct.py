@@ -262,8 +262,11 @@ def test_rows_beyond_the_scan_are_empty():
 
 @pytest.mark.parametrize("resampler", ["grid_sample", pytest.param("opencv", marks=pytest.mark.slow)])
 def test_an_overview_of_many_lines_a_cell_is_the_same_in_any_strips(resampler):
-    lines, pitch = 12_000, 20 * PITCH
-    motion, scan = motion_of(0.03, 1.01, -0.02), scan_of(torch.full((lines, RIG.width_px), DEPTH), Travel(PITCH))
+    lines, pitch, narrow = 12_000, 20 * PITCH, dataclasses.replace(RIG, width_px=100)
+    motion, scan = (
+        motion_of(0.03, 1.01, -0.02),
+        scan_of(torch.full((lines, narrow.width_px), DEPTH), Travel(PITCH), narrow),
+    )
     config = dataclasses.replace(CONFIG, pitch_mm=pitch, resampler=resampler)
     made = []
     for rows in (64, 10_000):
