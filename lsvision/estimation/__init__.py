@@ -10,7 +10,13 @@ rotations in a state, ``nis``, ``fisher_information`` and ``marginal_information
 matrix functions that all of them use, and the rule on bits.
 """
 
-from lsvision.estimation.bordered import BorderedFit, BorderedState, bordered_least_squares, shared_information
+from lsvision.estimation.bordered import (
+    BorderedFit,
+    BorderedState,
+    block_rows,
+    bordered_least_squares,
+    shared_information,
+)
 from lsvision.estimation.consistency import chi_square_tail, mean_chi_square_band, nees, nis
 from lsvision.estimation.control_chart import Change, ChangeRule, ControlChart, changes, control_chart
 from lsvision.estimation.cubature import AffineModel, slr
@@ -65,6 +71,7 @@ __all__ = [
     "Track",
     "Update",
     "apply",
+    "block_rows",
     "bordered_least_squares",
     "changes",
     "chi_square_tail",

@@ -99,14 +99,22 @@ class _Roots:
     of_shared: Float[Tensor, "*batch blocks rest shared_and_one"]
 
 
-def _roots(residual: Callable[[BorderedState], Tensor], state: BorderedState) -> _Roots:
+def block_rows(
+    residual: Callable[[BorderedState], Float[Tensor, "*batch blocks rows"]], state: BorderedState
+) -> Float[Tensor, "*batch blocks rows columns"]:
+    """Derivatives of each block's residuals by its own unknowns and by the shared ones, then the residuals."""
     own, shared = state.own.shape[-1], state.shared.shape[-1]
 
     def moved(move: Tensor) -> Tensor:
         return residual(BorderedState(state.shared + move[own:], state.own + move[:own]))
 
     rows = jacobian(moved, state.shared.new_zeros(own + shared))
-    root = upper_root(torch.cat([rows, residual(state)[..., None]], dim=-1))
+    return torch.cat([rows, residual(state)[..., None]], dim=-1)
+
+
+def _roots(residual: Callable[[BorderedState], Tensor], state: BorderedState) -> _Roots:
+    own = state.own.shape[-1]
+    root = upper_root(block_rows(residual, state))
     return _Roots(root[..., :own, :], root[..., own:, own:])
 
 

@@ -61,7 +61,12 @@ def iterations_of(batch: BatchCalibration) -> tuple[Iteration, ...]:
 
 def errors_along_scan_of(batch: BatchCalibration) -> tuple[ErrorAlongScan, ...]:
     """Those of one problem that are not much smaller than the largest."""
-    rms, length = batch.along_scan_rms_mm.tolist(), batch.along_scan_length_mm.tolist()
+    return named_errors(batch.along_scan_rms_mm, batch.along_scan_length_mm)
+
+
+def named_errors(rms_mm: Float[Tensor, "4"], length_mm: Float[Tensor, "4"]) -> tuple[ErrorAlongScan, ...]:
+    """Errors by component, those that are not much smaller than the largest."""
+    rms, length = rms_mm.tolist(), length_mm.tolist()
     return tuple(
         ErrorAlongScan(*error) for error in zip(COMPONENTS, rms, length, strict=True) if error[1] > _FAINT * max(rms)
     )

@@ -24,8 +24,14 @@ def calibrate_lines(
     line motion are those of the board under n.
     """
     seen = _moved_nominally(corners, n)
-    further: Sequence[BoardEdges | None] = [None if edges is None else replace(edges, points=displace(edges.points, n))]
+    further: Sequence[BoardEdges | None] = [None if edges is None else _edges_moved_nominally(edges, n)]
     return calibrate([seen], rig, replace(config, method="joint", prior_sigma=_KNOWN, mounting_pitch_deg=None), further)
+
+
+def _edges_moved_nominally(edges: BoardEdges, n: Tensor) -> BoardEdges:
+    """The same of edges; the right camera of a raw pair sees them later by the travel so stretched."""
+    later_mm = None if edges.later_mm is None else edges.later_mm * n[1]
+    return replace(edges, points=displace(edges.points, n), later_mm=later_mm)
 
 
 def _moved_nominally(corners: BoardCorners, n: Tensor) -> BoardCorners:

@@ -78,12 +78,12 @@ def _estimated(solution: Solution, edges: EdgeRows) -> Solution:
         length_mm=wave_length(errors.covariance(SEARCHED)) * Travel.of(problem).extent_mm,
         spectrum=errors.spectrum,
         log_ratio=errors.log_ratio,
-        factor_of_n=errors.factor_of_n,
+        factor_of_n=errors.factor_of_shared,
         noise=noise,
     )
     return replace(
         solution,
-        posterior=wider(estimate.posterior, errors.factor_of_n),
+        posterior=wider(estimate.posterior, errors.factor_of_shared),
         scatter=estimate.scatter,
         along_scan=along,
         edges=edges,

@@ -164,8 +164,7 @@ def _boards(solution: RigSolution, scans: Sequence[str], held_out: HeldOut | Non
 def _residuals(solution: RigSolution) -> tuple[CameraResiduals, CameraResiduals]:
     """What is left of the corners in the left and in the right image."""
     sightings, predicted = solution.sightings, solution.model.predict(solution.found.state)
-    pair = RawPair.of(solution.model.prior.rig, solution.shared.quantities)
-    depth = pair.meet(predicted.left[..., 0], predicted.right[..., 0], solution.shared.n).z
+    depth = solution.pair.meet(predicted.left[..., 0], predicted.right[..., 0], solution.shared.n).z
     left, right = (
         _residuals_of(eye, there, depth, sightings.valid)
         for eye, there in ((sightings.left, predicted.left), (sightings.right, predicted.right))

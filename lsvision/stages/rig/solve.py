@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from lsvision.estimation import BorderedFit, BorderedState, bordered_least_squares
+from lsvision.geometry import RawPair
 from lsvision.stages.rig.config import RigConfig
 from lsvision.stages.rig.model import POSE, SHARED, RigModel, RigPrior, Shared
 from lsvision.stages.rig.sightings import Sightings
@@ -20,6 +21,31 @@ _ROUNDS = 10
 _SOFT = 3.0  # scales at which a corner weighs a quarter
 _MOST = 0.7  # of a board's corners that must be left
 _SETTLED = 1.05  # ratio of two scales in a row
+_NO_ERROR = 1e-4  # sigmas
+
+
+@dataclass(frozen=True)
+class SharedErrors:
+    """What the residuals of each board, in sigmas, err by together besides white noise: Z ξ, ξ standard normal.
+
+    The covariance I + Z Zᵀ has the ``axes`` of Z, the singular vectors, along which an error's sigma is 1 / ``shrink``.
+    """
+
+    axes: Float[Tensor, "boards rows latents"]
+    shrink: Float[Tensor, "boards latents"]
+
+    @classmethod
+    def of(cls, by_latents: Float[Tensor, "boards rows latents"]) -> "SharedErrors":
+        """Those of Z."""
+        axes, size, _ = torch.linalg.svd(by_latents, full_matrices=False)
+        large = size.amax(0) > _NO_ERROR
+        return cls(axes[..., large], (1.0 + size[:, large].square()).rsqrt())
+
+    def whitened(self, residuals: Float[Tensor, "boards corners 4"]) -> Float[Tensor, "boards corners 4"]:
+        """As many that are independent, of variance 1: multiplied by the inverse root of their covariance."""
+        rows = residuals.flatten(-2)[..., None]
+        along = self.axes.mT @ rows
+        return (rows - self.axes @ ((1.0 - self.shrink)[..., None] * along))[..., 0].unflatten(-1, (-1, 4))
 
 
 @dataclass(frozen=True)
@@ -27,8 +53,8 @@ class RigSolution:
     """The posterior of a batch of problems.
 
     ``sightings`` are without the corners that were left out, which ``outliers`` counts by board; ``noise_scale`` is on
-    the corners' sigma, at least 1. ``along`` is the lower Cholesky factor of the covariance of each board's residuals,
-    in sigmas as stated, where its corners err together; None where they do not.
+    the corners' sigma, at least 1. ``along`` is what the corners of each board err by together, in sigmas as stated;
+    None where they do not.
     """
 
     model: RigModel
@@ -36,12 +62,17 @@ class RigSolution:
     outliers: Int[Tensor, "*batch boards"]
     found: BorderedFit
     noise_scale: Float[Tensor, "*batch"]
-    along: Float[Tensor, "boards rows rows"] | None = None
+    along: "SharedErrors | None" = None
 
     @property
     def shared(self) -> Shared:
         """Rig and motion."""
         return self.model.prior.shared(self.found.state.shared)
+
+    @property
+    def pair(self) -> RawPair:
+        """The cameras of one problem."""
+        return RawPair.of(self.model.prior.rig, self.shared.quantities)
 
     @property
     def whitened_covariance(self) -> Float[Tensor, "*batch shared shared"]:
@@ -63,7 +94,7 @@ class RigSolution:
     def whitened(self) -> Float[Tensor, "*batch boards corners 4"]:
         """Residuals of the corners, measured less predicted, in sigmas as stated; zero where a corner was left out."""
         residuals = corner_residuals(self.model, self.sightings, self.found.state)
-        return residuals if self.along is None else whitened_along(residuals, self.along)
+        return residuals if self.along is None else self.along.whitened(residuals)
 
 
 def solve_rig(sightings: Sightings, prior: RigPrior, config: RigConfig) -> RigSolution:
@@ -95,14 +126,6 @@ def _in_sigmas(factor: Float[Tensor, "*#batch 2 2"], off: Float[Tensor, "*#batch
     return torch.stack([first, (off[..., 1] - factor[..., 1, 0] * first) / factor[..., 1, 1]], dim=-1)
 
 
-def whitened_along(
-    residuals: Float[Tensor, "boards corners 4"], along: Float[Tensor, "boards rows rows"]
-) -> Float[Tensor, "boards corners 4"]:
-    """Residuals of corners that err together, as many and independent."""
-    rows = residuals.flatten(-2)[..., None]
-    return torch.linalg.solve_triangular(along, rows, upper=False)[..., 0].unflatten(-1, (-1, 4))
-
-
 def noise_scale_of(
     residuals: Float[Tensor, "*batch boards corners 4"], sightings: Sightings
 ) -> Float[Tensor, "*batch"]:
@@ -126,22 +149,31 @@ def _without_outliers(
         if bool((before <= _SETTLED * scale).all()):
             break
         weight = _each(sightings, scale.reciprocal()) / (1 + (off / (_SOFT * scale[..., None, None])).square())
-    valid = _near(sightings, off <= config.outlier_sigma * scale[..., None, None])
+    valid = near_corners(sightings.valid, off <= config.outlier_sigma * scale[..., None, None])
     return state, replace(sightings, valid=valid)
 
 
-def _near(sightings: Sightings, near: Bool[Tensor, "*batch boards corners"]) -> Bool[Tensor, "*batch boards corners"]:
-    """The valid corners that are near; of a board most of whose corners are not, all: outliers are no whole board."""
-    valid = sightings.valid & near
-    few = valid.sum(-1) < _MOST * sightings.valid.sum(-1)
-    return torch.where(few[..., None], sightings.valid, valid)
+def near_corners(
+    seen: Bool[Tensor, "*batch boards corners"], near: Bool[Tensor, "*batch boards corners"]
+) -> Bool[Tensor, "*batch boards corners"]:
+    """The seen corners that are near; of a board most of whose corners are not, all: outliers are no whole board."""
+    valid = seen & near
+    few = valid.sum(-1) < _MOST * seen.sum(-1)
+    return torch.where(few[..., None], seen, valid)
+
+
+def typical_scale(
+    square: Float[Tensor, "*batch boards corners"], valid: Bool[Tensor, "*batch boards corners"]
+) -> Float[Tensor, "*batch"]:
+    """How many sigmas as stated the median corner takes for one, at least 1, from the squares of distances in them."""
+    median = torch.where(valid, square, torch.nan).flatten(-2).nanmedian(-1).values
+    return (median / _NORMAL_MEDIAN).sqrt().clamp(min=1.0)
 
 
 def _distances(model: RigModel, sightings: Sightings, state: BorderedState) -> tuple[Tensor, Tensor]:
     """How far each corner is off, in sigmas as stated, and how many of them the median corner takes for one, >= 1."""
     square = corner_residuals(model, sightings, state).square().sum(-1)
-    median = torch.where(sightings.valid, square, torch.nan).flatten(-2).nanmedian(-1).values
-    return square.sqrt(), (median / _NORMAL_MEDIAN).sqrt().clamp(min=1.0)
+    return square.sqrt(), typical_scale(square, sightings.valid)
 
 
 def _each(sightings: Sightings, of_problem: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch boards corners"]:
@@ -154,7 +186,7 @@ def fit_rig(
     start: BorderedState,
     weight: Float[Tensor, "*batch boards corners"],
     config: RigConfig,
-    along: Float[Tensor, "boards rows rows"] | None = None,
+    along: "SharedErrors | None" = None,
 ) -> BorderedFit:
     """Estimate rig, motion and poses from corners; ``weight`` is what each residual in sigmas is multiplied by.
 
@@ -164,6 +196,6 @@ def fit_rig(
 
     def rows(state: BorderedState) -> Tensor:
         residuals = corner_residuals(model, sightings, state) * weight[..., None]
-        return (residuals if along is None else whitened_along(residuals, along)).flatten(-2)
+        return (residuals if along is None else along.whitened(residuals)).flatten(-2)
 
     return bordered_least_squares(rows, start, max_iterations=config.max_iterations, tolerance=config.tolerance)

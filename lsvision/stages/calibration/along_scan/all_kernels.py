@@ -21,7 +21,7 @@ from lsvision.stages.calibration.along_scan.parameters import Scores, climbed, l
 from lsvision.stages.calibration.along_scan.search import FoundErrors, evidence_by_component, evidence_of
 from lsvision.stages.calibration.along_scan.spectrum import Spectrum
 from lsvision.stages.calibration.along_scan.variances import as_large_as_probable, stepped
-from lsvision.stages.calibration.along_scan.waves import with_waves
+from lsvision.stages.calibration.along_scan.waves import of_all, of_waves, with_waves
 from lsvision.stages.calibration.problem import BoardProblem
 
 _STEPS, _STEPS_NEARBY = 30, 10
@@ -39,7 +39,15 @@ def search_with_edges(
     Args:
         near: a spectrum that the search begins near to: of the same kernels, and as many waves.
     """
-    equations = NormalEquations.of(problem, linearised, FINE, edges)
+    return most_probable_errors(NormalEquations.of(problem, linearised, FINE, edges), near)
+
+
+def most_probable_errors(equations: NormalEquations, near: Spectrum | None = None) -> FoundErrors:
+    """The errors along the scans given the normal equations of all data at the fine knots.
+
+    Args:
+        near: as of ``search_with_edges``.
+    """
     if near is not None and not near.waves and not near.variances[:, BROAD:].any():
         return found_errors(equations, near, near)  # a mean over kernels is nothing that steps lead to
     spectrum = _most_probable(equations) if near is None else stepped(equations, near, _STEPS_NEARBY)
@@ -50,11 +58,11 @@ def search_with_edges(
 
 def found_errors(equations: NormalEquations, spectrum: Spectrum, probable: Spectrum) -> FoundErrors:
     """The errors of a spectrum of greatest posterior, which is as large as ``probable`` in the mean."""
-    factor_of_n = Scores.of(equations, spectrum).factor_of_n
+    factor_of_shared = Scores.of(equations, spectrum).factor_of_shared
     kept = probable.variances > _NOTHING * probable.total.amax()
     probable = replace(probable, variances=torch.where(kept, probable.variances, 0.0))
     evidence, log_ratio = evidence_by_component(equations, probable.covariance(FINE)[None])
-    return FoundErrors(probable, log_ratio, probable.total.sqrt(), float(evidence), factor_of_n)
+    return FoundErrors(probable, log_ratio, probable.total.sqrt(), float(evidence), factor_of_shared)
 
 
 def _most_probable(equations: NormalEquations) -> Spectrum:
@@ -63,10 +71,10 @@ def _most_probable(equations: NormalEquations) -> Spectrum:
     count = len(kernel_family(FINE).log_prior)
     kernels = stepped(equations, Spectrum.of_kernels((usual / count).expand(-1, count)), _STEPS, _STEPS - _CAREFUL)
     best = with_waves(equations, kernels)
-    value = log_probability(equations, best, count)
+    value = of_waves(equations, best) if best.waves else of_all(equations, best)
     if evidence_of(equations, kernels.covariance(FINE)) > value:
         kernels = stepped(equations, kernels, _STEPS, _STEPS)
-        value, best = max((value, best), (log_probability(equations, kernels, count), kernels), key=_first)
+        value, best = max((value, best), (of_all(equations, kernels), kernels), key=_first)
     together = torch.zeros_like(kernels.variances)
     together[:, :BROAD] = usual / BROAD
     broad = stepped(equations, Spectrum.of_kernels(together), _STEPS_BROAD, _STEPS_BROAD - _CAREFUL)

@@ -110,16 +110,20 @@ class _Crossings:
         whitener = torch.linalg.solve(found.by_column, whitener) / found.sigma_px[:, None, None]
         lever, place = Lever.of(problem), (y - travel.start_mm[board]) / travel.extent_mm
         one = replace(lever, middle=lever.middle[board : board + 1])
+        place_right = None if found.later_mm is None else place + found.later_mm / travel.extent_mm
+        # The knots end where the corners do that were used.
+        within = (place >= 0.0) & (place <= 1.0)
+        if place_right is not None:
+            within &= (place_right >= 0.0) & (place_right <= 1.0)
         return cls(
             found=found,
             whitener=whitener,
             # About places on the edges, not measured ones: a motion must not fit the noise of its own lever.
             by_component=whitener @ one.directions(torch.lerp(start, stop, share)[None])[0].mT,
             place=place,
-            place_right=None if found.later_mm is None else place + found.later_mm / travel.extent_mm,
+            place_right=place_right,
             features=affine_features(body),
-            # The knots end where the corners do that were used.
-            kept=torch.isfinite(whitener).all((-2, -1)) & (place >= 0.0) & (place <= 1.0),
+            kept=torch.isfinite(whitener).all((-2, -1)) & within,
         )
 
     def without_outliers(self) -> "_Crossings":

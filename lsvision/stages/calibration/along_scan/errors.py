@@ -81,7 +81,7 @@ def errors_along_scan(
             unlike[place] = (probability[place] < _BEYOND_DOUBT) & (known.process_sigma == 0)
             continue
         rms[place], log_ratio[place] = errors.rms_mm, errors.log_ratio
-        factor_of_n[place] = errors.factor_of_n
+        factor_of_n[place] = errors.factor_of_shared
         spectrum.set(place, errors.spectrum)
         travel = Travel.of(one)
         length[place] = wave_length(errors.covariance(SEARCHED)) * travel.extent_mm

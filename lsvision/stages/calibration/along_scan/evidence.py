@@ -23,7 +23,8 @@ from lsvision.stages.calibration.linearise import affine_columns, point_factor
 from lsvision.stages.calibration.problem import BoardProblem, BoardState
 from lsvision.stages.calibration.reduction import affine_features
 
-_POSE = 6
+POSE = 6
+"""Unknowns that each board has of its own, which come first."""
 # The upper 0.1 % of a chi-square distribution, in sigmas of Wilson & Hilferty's normal approximation.
 _TAIL = 3.09
 
@@ -111,22 +112,54 @@ class NormalEquations:
             cross=across.unflatten(-1, (count, -1)).movedim(-2, 1),
             state=columns.flatten(1, 2).mT @ weighed.flatten(1, 2),
             prior=linearised.prior,
-            freedom=3.0 * float(valid.sum()) - _POSE * problem.boards,
+            freedom=3.0 * float(valid.sum()) - POSE * problem.boards,
             rms_mm=(along.square().sum((0, 1)) / valid.sum()).sqrt(),
         )
-        return corners if edges is None else corners._with(edges, linearised.of_edges(edges.rows))
+        if edges is None:
+            return corners
+        return corners._with(edges.rows[..., : count * knots.count], linearised.of_edges(edges.rows), edges.values)
 
-    def _with(self, edges: EdgeRows, by_state: Float[Tensor, "boards rows columns"]) -> "NormalEquations":
-        """These and the ones of edges."""
+    @classmethod
+    def of_rows(
+        cls,
+        by_knot: Float[Tensor, "boards rows knots_of_all"],
+        by_state: Float[Tensor, "boards rows columns"],
+        prior: Float[Tensor, "shared shared_and_one"],
+        values: float,
+        rms_mm: Float[Tensor, "4"],
+    ) -> "NormalEquations":
+        """Those of whitened rows on the processes at the knots, component by component, and on the state.
+
+        Args:
+            values: how many measured values the rows stand for.
+        """
+        boards, count, columns = len(by_knot), len(COMPONENTS), by_state.shape[-1]
+        knots = by_knot.shape[-1] // count
+        nothing = cls(
+            gram=by_knot.new_zeros(boards, count, count, knots, knots),
+            cross=by_knot.new_zeros(boards, count, knots, columns),
+            state=by_knot.new_zeros(boards, columns, columns),
+            prior=prior,
+            freedom=-float(POSE * boards),
+            rms_mm=rms_mm,
+        )
+        return nothing._with(by_knot, by_state, values)
+
+    def _with(
+        self,
+        by_knot: Float[Tensor, "boards rows knots_of_all"],
+        by_state: Float[Tensor, "boards rows columns"],
+        values: float,
+    ) -> "NormalEquations":
+        """These and the ones of further rows."""
         count, knots = self.gram.shape[-3], self.gram.shape[-1]
-        by_knot = edges.rows[..., : count * knots]
         gram = (by_knot.mT @ by_knot).unflatten(-1, (count, knots)).unflatten(1, (count, knots)).transpose(2, 3)
         return replace(
             self,
             gram=self.gram + gram,
             cross=self.cross + (by_knot.mT @ by_state).unflatten(1, (count, knots)),
             state=self.state + by_state.mT @ by_state,
-            freedom=self.freedom + edges.values,
+            freedom=self.freedom + values,
         )
 
     def given(
@@ -169,9 +202,9 @@ class NormalEquations:
                 columns)``.
             log_det: of what they were freed from, ``(boards, *candidates)``.
         """
-        pose = torch.linalg.cholesky_ex(state[..., :_POSE, :_POSE]).L
-        removed = torch.linalg.solve_triangular(pose, state[..., :_POSE, _POSE:], upper=False)
-        rest = (state[..., _POSE:, _POSE:] - removed.mT @ removed).sum(0) + self.prior.mT @ self.prior
+        pose = torch.linalg.cholesky_ex(state[..., :POSE, :POSE]).L
+        removed = torch.linalg.solve_triangular(pose, state[..., :POSE, POSE:], upper=False)
+        rest = (state[..., POSE:, POSE:] - removed.mT @ removed).sum(0) + self.prior.mT @ self.prior
         pivots = torch.linalg.cholesky_ex(rest).L.diagonal(dim1=-2, dim2=-1)
         by_board = (log_det + 2.0 * pose.diagonal(dim1=-2, dim2=-1).log().sum(-1)).sum(0)
         total, chi_square = by_board + 2.0 * pivots[..., :-1].log().sum(-1), pivots[..., -1].square()

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from lsvision.stages.calibration.along_scan.kernels import SEARCHED, Knots
@@ -30,9 +30,15 @@ class Travel:
     @classmethod
     def of(cls, problem: BoardProblem) -> "Travel":
         """Of a problem; its longest board sets the unit."""
-        travel = problem.points[..., 1]
-        start = torch.where(problem.valid, travel, torch.inf).amin(-1)
-        end = torch.where(problem.valid, travel, -torch.inf).amax(-1)
+        return cls.spanning(problem.points[..., 1], problem.valid)
+
+    @classmethod
+    def spanning(
+        cls, travel: Float[Tensor, "*batch boards corners"], valid: Bool[Tensor, "*batch boards corners"]
+    ) -> "Travel":
+        """Of corners at some travel, mm."""
+        start = torch.where(valid, travel, torch.inf).amin(-1)
+        end = torch.where(valid, travel, -torch.inf).amax(-1)
         return cls(start, (end - start).amax(-1).clamp(min=1e-9))
 
     def place(self, problem: BoardProblem) -> Float[Tensor, "*batch boards corners"]:
@@ -67,10 +73,17 @@ class Lever:
     @classmethod
     def of(cls, problem: BoardProblem) -> "Lever":
         """Those of a problem's corners."""
-        points = torch.where(problem.valid[..., None], problem.points, torch.nan)
-        middle = points.nanmean(-2)
-        across = (points - middle[..., None, :])[..., ::2].nan_to_num(nan=0.0)
-        rms = (across.square().sum((-3, -2, -1)) / problem.valid.sum((-2, -1))).sqrt().clamp(min=1e-9)
+        return cls.about(problem.points, problem.valid)
+
+    @classmethod
+    def about(
+        cls, points: Float[Tensor, "*batch boards corners 3"], valid: Bool[Tensor, "*batch boards corners"]
+    ) -> "Lever":
+        """Those of corners at (x, travel, z), mm."""
+        seen = torch.where(valid[..., None], points, torch.nan)
+        middle = seen.nanmean(-2)
+        across = (seen - middle[..., None, :])[..., ::2].nan_to_num(nan=0.0)
+        rms = (across.square().sum((-3, -2, -1)) / valid.sum((-2, -1))).sqrt().clamp(min=1e-9)
         return cls(middle, rms)
 
     def directions(self, points: Float[Tensor, "*batch boards points 3"]) -> Float[Tensor, "*batch boards points 4 3"]:

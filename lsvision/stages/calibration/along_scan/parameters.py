@@ -64,12 +64,13 @@ def log_probability(equations: NormalEquations, spectrum: Spectrum, choices: int
 class Scores:
     """Gradient and expected information of the log posterior by the logarithms of ``active`` variances, by frequencies.
 
-    ``active`` are the components and kernels, waves after kernels; ``of_n`` is the change of n by each parameter.
+    ``active`` are the components and kernels, waves after kernels; ``of_shared`` is the change of n, and of what else
+    all boards share, by each parameter.
     """
 
     gradient: Float[Tensor, " parameters"]
     information: Float[Tensor, "parameters parameters"]
-    of_n: Float[Tensor, "3 parameters"]
+    of_shared: Float[Tensor, "shared parameters"]
     active: Int[Tensor, "active 2"]
 
     @classmethod
@@ -80,7 +81,7 @@ class Scores:
         alpha, component = data.weighed[:, slopes.component], slopes.component
         shown = torch.einsum("bsi,sij,bsj->s", alpha, slopes.slope, alpha)
         expected = torch.einsum("sij,bsji->s", slopes.slope, data.own[:, component])
-        moved = -torch.einsum("bnsk,skl,bsl->ns", data.of_n[:, :, component], slopes.slope, alpha)
+        moved = -torch.einsum("bnsk,skl,bsl->ns", data.of_shared[:, :, component], slopes.slope, alpha)
         together = slopes.parameter[:, None] == torch.arange(slopes.count)
         sum_of = together.to(alpha)
         gradient = sum_of.mT @ (0.5 * (shown - expected))
@@ -108,9 +109,9 @@ class Scores:
         return self.covariance.diagonal()[len(self.active) :].sqrt()
 
     @property
-    def factor_of_n(self) -> Float[Tensor, "3 3"]:
-        """Factor of what n's covariance owes to the parameters: see the module."""
-        covariance = 2.0 * self.of_n @ self.covariance @ self.of_n.mT
+    def factor_of_shared(self) -> Float[Tensor, "shared shared"]:
+        """Factor of what the covariance of n, and of what else is shared, owes to the parameters: see the module."""
+        covariance = 2.0 * self.of_shared @ self.covariance @ self.of_shared.mT
         values, vectors = torch.linalg.eigh((covariance + covariance.mT) / 2)
         return vectors * values.clamp(min=0.0).sqrt()
 

@@ -15,7 +15,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lsvision.estimation.gaussian_process import covariance_root
-from lsvision.stages.calibration.along_scan.evidence import NormalEquations
+from lsvision.stages.calibration.along_scan.evidence import POSE, NormalEquations
 
 _NOTHING_MM = 1e-7  # what a process displaces no line by
 
@@ -24,12 +24,13 @@ _NOTHING_MM = 1e-7  # what a process displaces no line by
 class Projected:
     """The data at the knots of each board and component, poses and n projected out.
 
-    ``of_n`` is the change of n by what displaces the data at the knots. Their precision is the ``gram`` of corners and
-    edges less that of ``removed``, which errors along the scan, poses and n stand for.
+    ``of_shared`` is the change of n, and of what else all boards share, by what displaces the data at the knots. Their
+    precision is the ``gram`` of corners and edges less that of ``removed``, which errors along the scan, poses and what
+    is shared stand for.
     """
 
     weighed: Float[Tensor, "boards 4 knots"]
-    of_n: Float[Tensor, "boards 3 4 knots"]
+    of_shared: Float[Tensor, "boards shared 4 knots"]
     gram: Float[Tensor, "boards 4 4 knots knots"]
     removed: Float[Tensor, "boards rows 4 knots"]
 
@@ -60,11 +61,11 @@ class Projected:
         solved = _StateOfAll.of(equations.state - by_state.mT @ by_state, equations.prior)
         cross = equations.cross.flatten(1, 2) - by_knots.mT @ by_state
         weighed = cross[..., -1] - (cross[..., :-1] @ solved.mean[..., None])[..., 0]
-        of_n = solved.covariance[:, 6:] @ cross[..., :-1].mT
+        of_shared = solved.covariance[:, POSE:] @ cross[..., :-1].mT
         removed = torch.cat([by_knots, covariance_root(solved.covariance).mT @ cross[..., :-1].mT], dim=1)
         return cls(
             weighed=weighed.unflatten(-1, (count, knots)),
-            of_n=of_n.unflatten(-1, (count, knots)),
+            of_shared=of_shared.unflatten(-1, (count, knots)),
             gram=gram,
             removed=removed.unflatten(-1, (count, knots)),
         )
@@ -72,23 +73,25 @@ class Projected:
 
 @dataclass(frozen=True)
 class _StateOfAll:
-    """Poses and n given the normal equations of all boards: mean, and covariance of each board's nine unknowns."""
+    """What each board has of its own and shares, given the normal equations of all boards: mean and covariance."""
 
-    mean: Float[Tensor, "boards 9"]
-    covariance: Float[Tensor, "boards 9 9"]
+    mean: Float[Tensor, "boards state"]
+    covariance: Float[Tensor, "boards state state"]
 
     @classmethod
-    def of(cls, equations: Float[Tensor, "boards 10 10"], prior: Float[Tensor, "3 4"]) -> "_StateOfAll":
-        """The solution; ``prior`` are whitened rows on n."""
-        pose, right = equations[:, :6, :6], equations[:, :6, 6:]
-        eye = torch.eye(6, dtype=pose.dtype, device=pose.device)
+    def of(
+        cls, equations: Float[Tensor, "boards columns columns"], prior: Float[Tensor, "shared shared_and_one"]
+    ) -> "_StateOfAll":
+        """The solution; ``prior`` are whitened rows on what is shared."""
+        pose, right, count = equations[:, :POSE, :POSE], equations[:, :POSE, POSE:], prior.shape[-1] - 1
+        eye = torch.eye(POSE, dtype=pose.dtype, device=pose.device)
         own = torch.cholesky_solve(eye.expand_as(pose), torch.linalg.cholesky(pose))
         by_shared = own @ right
-        rest = (equations[:, 6:, 6:] - right.mT @ by_shared).sum(0) + prior.mT @ prior
-        shared = torch.linalg.inv(rest[:3, :3])
-        n = shared @ rest[:3, 3]
-        back, mean = by_shared[..., :3], by_shared[..., 3] - by_shared[..., :3] @ n
+        rest = (equations[:, POSE:, POSE:] - right.mT @ by_shared).sum(0) + prior.mT @ prior
+        shared = torch.linalg.inv(rest[:-1, :-1])
+        value = shared @ rest[:-1, -1]
+        back, mean = by_shared[..., :-1], by_shared[..., -1] - by_shared[..., :-1] @ value
         poses = own + back @ shared @ back.mT
         top = torch.cat([poses, -back @ shared], dim=-1)
-        bottom = torch.cat([-(back @ shared).mT, shared.expand(len(own), 3, 3)], dim=-1)
-        return cls(torch.cat([mean, n.expand(len(own), 3)], dim=-1), torch.cat([top, bottom], dim=-2))
+        bottom = torch.cat([-(back @ shared).mT, shared.expand(len(own), count, count)], dim=-1)
+        return cls(torch.cat([mean, value.expand(len(own), count)], dim=-1), torch.cat([top, bottom], dim=-2))

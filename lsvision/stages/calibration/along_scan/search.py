@@ -60,7 +60,8 @@ class FoundErrors:
     ``rms_mm`` of each component is the most probable one, and little more than the residuals show: a covariance that is
     a mean over amplitudes is larger, above all that of waves of which most is taken for poses and n.
     ``log_ratio`` is how much more probable the corners are with the errors of each component than without.
-    ``factor_of_n`` is that of what n's covariance owes to the spectrum, which is known no better than the data show it.
+    ``factor_of_shared`` is that of what the covariance of n, and of what else all boards share, owes to the spectrum,
+    which is known no better than the data show it.
     The constant that is missing in the evidence is the same for all linearisations of a problem.
     """
 
@@ -68,7 +69,7 @@ class FoundErrors:
     log_ratio: Float[Tensor, "4"]
     rms_mm: Float[Tensor, "4"]
     log_evidence: float
-    factor_of_n: Float[Tensor, "3 3"]
+    factor_of_shared: Float[Tensor, "shared shared"]
 
     def covariance(self, knots: Knots) -> Float[Tensor, "4 knots knots"]:
         """Covariance of the errors of each component at knots, mm²."""

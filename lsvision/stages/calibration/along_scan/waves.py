@@ -9,10 +9,11 @@ the freedom of their frequencies allowed for.
 Source: Solin & Särkkä 2014; MacKay 2003, Information Theory, Inference, and Learning Algorithms, ch. 28.
 """
 
+from collections.abc import Iterator
 from dataclasses import replace
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from lsvision.estimation import chi_square_tail
@@ -34,6 +35,8 @@ _LEAST_SHARE = 0.05  # of the components' variance, that a wave has at first
 _FAINT = 0.01  # of the largest component's variance: what components of less show is no wave's frequency
 _BEGIN = 1e-3  # variance of each broad-band kernel at first, of that of the residuals
 _ROUNDS, _STEPS, _CLIMBED = 8, 2, 24
+_APART, _BEATING = 0.1, 1e-3  # waves per unit; share of the variance
+_TWINS = 0.1  # waves per unit within which two are tried as one
 _RESOLVED = 0.1  # waves per unit to which a wave's frequency is known
 _FREE = 4.0  # of the information on a frequency, that keeps a step short where there is none
 _TRIED = torch.arange(0.3, 8.01, 0.05, dtype=torch.float64)
@@ -45,16 +48,43 @@ def with_waves(equations: NormalEquations, kernels: Spectrum) -> Spectrum:
     best = _begun(equations, kernels)
     if not best.waves:
         return kernels
-    best = _settled(equations, best)
+    best = _without_twins(equations, _settled(equations, best))
     while best.waves < MOST_WAVES:
-        further = _one_more(equations, best)
-        if further is None or log_probability(equations, further, BROAD) <= log_probability(equations, best, BROAD):
+        further = _better(equations, best)
+        if further is None:
             break
-        best = further
-    return best if log_probability(equations, best, BROAD) > _of_all(equations, kernels) else kernels
+        best = _without_twins(equations, further)
+    return best if of_waves(equations, best) > of_all(equations, kernels) else kernels
 
 
-def _of_all(equations: NormalEquations, kernels: Spectrum) -> float:
+def _better(equations: NormalEquations, spectrum: Spectrum) -> Spectrum | None:
+    """A more probable spectrum of one wave more; None where none is found."""
+    least = of_waves(equations, spectrum)
+    return next(
+        (further for further in _of_one_more(equations, spectrum) if of_waves(equations, further) > least), None
+    )
+
+
+def _of_one_more(equations: NormalEquations, spectrum: Spectrum) -> Iterator[Spectrum]:
+    """Spectra of one wave more: that which the data show most, and with two in place of each wave, the largest first.
+
+    The latter only where broad-band errors take a part: two waves that beat are taken for one and something broad.
+    """
+    further = _one_more(equations, spectrum)
+    if further is not None:
+        yield further
+    if bool(spectrum.variances.sum() > _BEATING * spectrum.total.sum()):
+        for wave in spectrum.of_waves.sum(0).argsort(descending=True):
+            yield _parted(equations, spectrum, wave)
+
+
+def of_waves(equations: NormalEquations, spectrum: Spectrum) -> float:
+    """Log evidence for waves beside broad-band kernels."""
+    return log_probability(equations, spectrum, BROAD)
+
+
+def of_all(equations: NormalEquations, kernels: Spectrum) -> float:
+    """Log evidence for kernels, any of all."""
     return log_probability(equations, kernels, kernels.variances.shape[-1])
 
 
@@ -82,6 +112,19 @@ def _broad(equations: NormalEquations, like: Spectrum) -> Float[Tensor, "4 kerne
     return broad
 
 
+def _parted(equations: NormalEquations, spectrum: Spectrum, wave: Tensor) -> Spectrum:
+    """A spectrum with two waves in place of one."""
+    frequency, variance = spectrum.frequency.clone(), spectrum.of_waves.clone()
+    frequency[wave] -= _APART
+    variance[:, wave] /= 2
+    further = Spectrum(
+        _broad(equations, spectrum),
+        torch.cat([frequency, (frequency[wave] + 2 * _APART)[None]]),
+        torch.cat([variance, variance[:, wave, None]], dim=-1),
+    )
+    return _settled(equations, further)
+
+
 def _settled(equations: NormalEquations, spectrum: Spectrum) -> Spectrum:
     """Frequencies and variances near the most probable ones; waves of no known frequency are none."""
     for _ in range(_ROUNDS):
@@ -96,6 +139,31 @@ def _settled(equations: NormalEquations, spectrum: Spectrum) -> Spectrum:
     resolved = scores.frequency_sigma < _RESOLVED
     spectrum = replace(spectrum, frequency=spectrum.frequency[resolved], of_waves=spectrum.of_waves[:, resolved])
     return climbed(equations, spectrum, _CLIMBED) if spectrum.waves else spectrum
+
+
+def _without_twins(equations: NormalEquations, spectrum: Spectrum) -> Spectrum:
+    """Waves of nearly one frequency made one where that is more probable: components begun apart may have one each."""
+    while spectrum.waves > 1:
+        order = spectrum.frequency.argsort()
+        gap = spectrum.frequency[order].diff()
+        twins = order[gap.argmin() + torch.arange(2)]
+        if not bool(gap.min() < _TWINS):
+            break
+        joined = _settled(equations, _joined(spectrum, twins))
+        if of_waves(equations, joined) <= of_waves(equations, spectrum):
+            break
+        spectrum = joined
+    return spectrum
+
+
+def _joined(spectrum: Spectrum, twins: Int[Tensor, "2"]) -> Spectrum:
+    """With one wave in place of two, between their frequencies, as large as both."""
+    share = (spectrum.of_waves[:, twins] / spectrum.total[:, None].clamp(min=1e-300)).sum(0)
+    frequency, variance = spectrum.frequency.clone(), spectrum.of_waves.clone()
+    frequency[twins[0]] = (share * frequency[twins]).sum() / share.sum()
+    variance[:, twins[0]] = variance[:, twins].sum(1)
+    kept = torch.arange(spectrum.waves) != twins[1]
+    return replace(spectrum, frequency=frequency[kept], of_waves=variance[:, kept])
 
 
 def _one_more(equations: NormalEquations, spectrum: Spectrum) -> Spectrum | None:
