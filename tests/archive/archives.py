@@ -56,6 +56,13 @@ def make_scan(folder: Path, lines: int = 96, seed: int = 0, *, stereo: bool = Fa
     return folder
 
 
+def touch(root: Path, *names: str) -> None:
+    """Folders that look like scans from outside."""
+    for name in names:
+        (root / name).mkdir(parents=True)
+        (root / name / "scan.yaml").write_text("")
+
+
 def shaken(lines: int = 96, *components: str) -> LineMotion:
     """A motion of some components, or of all but dy, with what was found."""
     components = components or ("dx", "dz", "roll")

@@ -19,6 +19,11 @@ def small_rig(full_rig: Rig) -> Rig:
 
 
 @pytest.fixture
+def coarse(full_rig: Rig) -> Rig:
+    return scaled_rig(full_rig, 16)
+
+
+@pytest.fixture
 def board() -> Board:
     return Board(12, 9, 30.0)
 

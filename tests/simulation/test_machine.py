@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from lsvision.errors import ConfigError
-from lsvision.geometry import line_at, scaled_rig, travel_at, zero_disparity_mm
+from lsvision.geometry import line_at, travel_at, zero_disparity_mm
 from lsvision.simulation import Acquisition, EncoderConfig, MotionConfig, SceneConfig, SensorConfig, simulate
 from lsvision.simulation.lighting import Facet, line_lights
 from lsvision.simulation.sensor import halo_px, integrate, received
@@ -15,11 +15,6 @@ from lsvision.simulation.surfaces import Look
 
 CLEAN = SensorConfig(noise=0.0, bits=16, supersampling=2, exposure=0.5)
 SHORT = Acquisition(1.12, lines=32)
-
-
-@pytest.fixture
-def coarse(full_rig):
-    return scaled_rig(full_rig, 16)
 
 
 def test_lights_along_the_sensor_line_by_hand(full_rig):

@@ -11,7 +11,6 @@ from lsvision.geometry import (
     aligned_rotation,
     focal_length_px,
     line_at,
-    scaled_rig,
     travel_at,
     triangulate,
     zero_disparity_mm,
@@ -27,16 +26,10 @@ from lsvision.simulation import (
 )
 from lsvision.simulation.rail import corrugation_mm, crown_place
 from lsvision.simulation.trajectory import cast_rays
-from lsvision.types import Rig
 from tests.combinations import crossed
 from tests.simulation.corner_fit import fit_corners
 
 SCENES = [SceneConfig(yaw_deg=10.0, pitch_deg=5.0), SceneConfig("sheet", roll_deg=3.0), SceneConfig("rail")]
-
-
-@pytest.fixture
-def coarse(full_rig) -> Rig:
-    return scaled_rig(full_rig, 16)
 
 
 PITCH = 1.12

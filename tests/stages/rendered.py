@@ -17,7 +17,7 @@ from lsvision.simulation import (
     simulate,
 )
 from lsvision.stages.corners.find import LocatedCorners, find_corners, locate_in_images, measure_corners
-from lsvision.types import Board, BoardCorners, DepthView, Rig, Scan, StereoPair, TensorImage, Transport
+from lsvision.types import Board, BoardCorners, DepthView, Motion, Rig, Scan, StereoPair, TensorImage, Transport
 
 FULL_RIG = Rig(7142, 10.0, 113.84, 354.0, 1042.0, 6099.0)
 SMALL_RIG = scaled_rig(FULL_RIG, 16)
@@ -76,6 +76,11 @@ def stereo_corners(source: Simulation) -> BoardCorners:
 def depth_corners(source: Simulation) -> BoardCorners:
     """The corners as one image and a depth map measure them."""
     return find_corners(depth_scan(source), BOARD)
+
+
+def motion_of(*n: float) -> Motion:
+    """A motion that is known exactly."""
+    return Motion(torch.tensor(n, dtype=torch.float64), torch.zeros(3, 3, dtype=torch.float64))
 
 
 def true_measurement(source: Simulation) -> Tensor:

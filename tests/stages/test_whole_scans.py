@@ -15,6 +15,7 @@ from lsvision.stages.correction.grid import plan_product
 from lsvision.stages.disparity.depth import depth_of
 from lsvision.types import DepthView, Motion, Rig, Scan, TensorImage, Travel
 from tests.combinations import crossed
+from tests.stages.rendered import motion_of
 
 PITCH = 0.56
 # An eighth of the camera's pixels, and a field of two tiles.
@@ -22,10 +23,6 @@ RIG = Rig(700, 80.0, 113.84, 354.0, 129.8, 761.9)
 LINES = 400
 CONFIG = CorrectionConfig(height_range_mm=(-30.0, 30.0), strip_rows=10_000)
 PARTS = ("color", "height", "valid", "source")
-
-
-def motion_of(*n: float) -> Motion:
-    return Motion(torch.tensor(n, dtype=torch.float64), torch.zeros(3, 3, dtype=torch.float64))
 
 
 ASKEW = motion_of(-0.045, 0.98, 0.05)

@@ -1,7 +1,5 @@
 """Scans found below folders, in lists and by patterns."""
 
-from pathlib import Path
-
 import fsspec
 import pytest
 import torch
@@ -10,13 +8,7 @@ from lsvision.archive import find_scans, local_archive
 from lsvision.errors import ConfigError
 from lsvision.io import read_scan, write_response
 from lsvision.types import CameraResponse
-from tests.archive.archives import WIDTH
-
-
-def touch(root: Path, *names: str) -> None:
-    for name in names:
-        (root / name).mkdir(parents=True)
-        (root / name / "scan.yaml").write_text("")
+from tests.archive.archives import WIDTH, touch
 
 
 def keys(archive: object) -> list[str]:

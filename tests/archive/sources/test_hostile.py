@@ -15,13 +15,7 @@ from lsvision.errors import ConfigError, FileFormatError
 from lsvision.experiments.command_line import in_one_line
 from lsvision.io import scan_sha256
 from lsvision.io.inside import path_inside
-from tests.archive.archives import PROCESSING, make_scan, process
-
-
-def touch(root: Path, *names: str) -> None:
-    for name in names:
-        (root / name).mkdir(parents=True)
-        (root / name / "scan.yaml").write_text("")
+from tests.archive.archives import PROCESSING, make_scan, process, touch
 
 
 def everything_below(folder: Path) -> set[str]:

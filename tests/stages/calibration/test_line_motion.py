@@ -17,8 +17,9 @@ from lsvision.stages.calibration.calibrate import calibrate
 from lsvision.stages.calibration.config import CalibrationConfig
 from lsvision.stages.calibration.known_motion import calibrate_lines
 from lsvision.stages.calibration.methods import joint
-from lsvision.types import BoardCorners, BoardEdges
+from lsvision.types import BoardEdges
 from tests.stages.calibration.boards import FOUR_TILTS, RIG, SIGMA, Corners, simulate
+from tests.stages.calibration.edges import with_lines
 from tests.stages.calibration.test_correlated import small_problem
 
 SHARP = (0.004, 0.004, 0.004)
@@ -41,16 +42,6 @@ def vibrating(corners: Corners, motions) -> Corners:
     return dataclasses.replace(corners, points=points)
 
 
-def with_lines(corners: Corners, pitch_mm: float = 0.5, beyond_mm: float = 20.0) -> list[BoardCorners]:
-    """The boards in scans that reach beyond them."""
-    boards = []
-    for board in corners.boards():
-        first, last = (float(side) for side in board.points[:, 1].aminmax())
-        lines = torch.arange(first - beyond_mm, last + beyond_mm, pitch_mm, dtype=torch.float64)
-        boards.append(dataclasses.replace(board, travel_mm=lines))
-    return boards
-
-
 def shaken_boards(seed: int, wavelengths=(150.0,), tilts=FOUR_TILTS):
     """Boards under vibration of x, z and roll, and the true motion of their lines."""
     torch.manual_seed(seed)
@@ -63,7 +54,7 @@ def shaken_boards(seed: int, wavelengths=(150.0,), tilts=FOUR_TILTS):
         return pad(torch.stack(parts, dim=-1), (0, 1))
 
     moved = vibrating(corners, motion)
-    boards = with_lines(moved)
+    boards = with_lines(moved, 0.5)
     longest = max(len(board.travel_mm) for board in boards)
     lines = torch.stack([pad(board.travel_mm, (0, longest - len(board.travel_mm))) for board in boards])
     truth = motion(lines)
@@ -159,7 +150,7 @@ def test_scans_are_straight_once_their_lines_are_steadied():
 
 def test_a_still_scan_gives_the_same_bits_with_and_without():
     torch.manual_seed(3)
-    boards = with_lines(simulate(FOUR_TILTS, sigma=SIGMA))
+    boards = with_lines(simulate(FOUR_TILTS, sigma=SIGMA), 0.5)
     auto, none = (calibrate(boards, RIG, CalibrationConfig(line_motion=choice)) for choice in ("auto", "none"))
     assert auto.line_motions == () == none.line_motions
     assert torch.equal(auto.motion.n, none.motion.n)

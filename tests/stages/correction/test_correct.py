@@ -24,7 +24,7 @@ from lsvision.stages.correction.correct import Correction, correct_scan
 from lsvision.stages.correction.grid import plan_product
 from lsvision.stages.disparity.depth import depth_of
 from lsvision.types import DepthView, Motion, Rig, Scan, TensorImage, Travel
-from tests.stages.rendered import BOARD, PITCH, SMALL_RIG, depth_scan
+from tests.stages.rendered import BOARD, PITCH, SMALL_RIG, depth_scan, motion_of
 
 LINES = 150
 DEPTH = 790.0
@@ -43,10 +43,6 @@ MOTIONS = {
     "encoder": ((-0.02, 1.01, 0.01), Travel(PITCH, LOG)),
     "reverse encoder": ((-0.02, 1.01, 0.01), Travel(PITCH, LOG, "reverse")),
 }
-
-
-def motion_of(n: tuple[float, float, float]) -> Motion:
-    return Motion(torch.tensor(n, dtype=torch.float64), torch.zeros(3, 3, dtype=torch.float64))
 
 
 def scan_of(depth: Tensor, travel: Travel, rig: Rig = RIG) -> Scan:
@@ -73,7 +69,7 @@ def model_source(grid, motion: Motion, travel: Travel, depth: float) -> tuple[Te
 @pytest.mark.parametrize("case", MOTIONS)
 def test_source_and_height_of_a_plane_agree_with_the_model(case):
     n, travel = MOTIONS[case]
-    motion, scan = motion_of(n), scan_of(flat(), travel)
+    motion, scan = motion_of(*n), scan_of(flat(), travel)
     grid = plan_product(scan, motion, CONFIG)
     true_line, true_column = model_source(grid, motion, travel, DEPTH)
     beyond = [true_line, LINES - 1 - true_line, true_column, RIG.width_px - 1 - true_column]
@@ -98,7 +94,7 @@ def test_nominal_product_of_the_zero_plane_is_the_scan():
     pitch = object_pitch_mm(RIG)
     z0 = zero_disparity_mm(RIG)
     scan = scan_of(flat(z0).double(), Travel(pitch))
-    motion = motion_of((0.0, 1.0, 0.0))
+    motion = motion_of(0.0, 1.0, 0.0)
     grid = plan_product(scan, motion, CONFIG)
     grid = dataclasses.replace(
         grid, origin_x_mm=-RIG.principal_left_px * pitch, columns=RIG.width_px - 1, rows=LINES - 1
@@ -112,7 +108,7 @@ def test_nominal_product_of_the_zero_plane_is_the_scan():
 @pytest.mark.parametrize("case", ["nominal", "askew", "reverse encoder"])
 def test_strips_change_no_bit(case):
     n, travel = MOTIONS[case]
-    motion = motion_of(n)
+    motion = motion_of(*n)
     depth = DEPTH + 6 * torch.sin(torch.arange(LINES)[:, None] / 25.0) + 0.02 * torch.arange(RIG.width_px)
     depth[40:60, 80:120] -= 15.0
     depth[torch.rand(depth.shape) < 0.02] = torch.nan
@@ -140,7 +136,7 @@ def stepped(near_on_the_right: bool) -> Tensor:
 
 def test_at_a_step_the_nearer_surface_wins():
     # Right of the camera a nearer surface stands over what is behind it.
-    motion = motion_of((0.0, 1.0, 0.0))
+    motion = motion_of(0.0, 1.0, 0.0)
     scan = scan_of(stepped(near_on_the_right=True), Travel(PITCH))
     grid = plan_product(scan, motion, CONFIG)
     strip = Correction(scan, depth_of(scan), motion, CONFIG, grid).strip((40, 80))
@@ -159,7 +155,7 @@ def test_at_a_step_the_nearer_surface_wins():
 
 
 def test_behind_a_step_nothing_is_interpolated():
-    motion = motion_of((0.0, 1.0, 0.0))
+    motion = motion_of(0.0, 1.0, 0.0)
     scan = scan_of(stepped(near_on_the_right=False), Travel(PITCH))
     grid = plan_product(scan, motion, CONFIG)
     strip = Correction(scan, depth_of(scan), motion, CONFIG, grid).strip((40, 80))
@@ -175,7 +171,7 @@ def test_behind_a_step_nothing_is_interpolated():
 
 
 def test_a_step_along_the_motion_is_not_interpolated():
-    motion = motion_of((0.0, 0.99, 0.1))
+    motion = motion_of(0.0, 0.99, 0.1)
     depth = flat(800.0)
     depth[75:] = 780.0
     scan = scan_of(depth, Travel(PITCH))
@@ -186,7 +182,7 @@ def test_a_step_along_the_motion_is_not_interpolated():
 
 
 def test_small_holes_are_bridged_for_colour_alone():
-    motion = motion_of((0.0, 1.0, 0.0))
+    motion = motion_of(0.0, 1.0, 0.0)
     config = dataclasses.replace(CONFIG, strip_rows=1000, pitch_mm=1.1)  # no cell exactly on a line
     depth = flat()
     depth[50:60, 90:100] = torch.nan
@@ -213,7 +209,7 @@ def test_small_holes_are_bridged_for_colour_alone():
 @pytest.mark.parametrize("case", MOTIONS)
 def test_the_grid_holds_the_whole_field(case):
     n, travel = MOTIONS[case]
-    motion, scan = motion_of(n), scan_of(flat(), travel)
+    motion, scan = motion_of(*n), scan_of(flat(), travel)
     grid = plan_product(scan, motion, CONFIG)
     u = torch.tensor([0.0, RIG.width_px - 1.0]).double()
     for height in CONFIG.height_range_mm:
@@ -242,7 +238,7 @@ class Unreadable:
 
 def test_planning_a_long_scan_reads_nothing():
     scan = Scan(Path("long"), RIG, Travel(PITCH), DepthView(Unreadable(), Unreadable()))
-    motion = motion_of((0.02, 1.0, 0.01))
+    motion = motion_of(0.02, 1.0, 0.01)
     grid = plan_product(scan, motion, CONFIG)
     assert abs(grid.rows - 1e7 * motion.stretch) < 100
     assert grid.pitch_mm == PITCH
@@ -254,7 +250,7 @@ def test_planning_a_long_scan_reads_nothing():
 
 
 def test_rows_beyond_the_scan_are_empty():
-    motion = motion_of((0.0, 1.0, 0.0))
+    motion = motion_of(0.0, 1.0, 0.0)
     scan = scan_of(flat(), Travel(PITCH))
     grid = dataclasses.replace(plan_product(scan, motion, CONFIG), rows=10_000)
     strip = Correction(scan, depth_of(scan), motion, CONFIG, grid).strip((5000, 5003))
@@ -266,8 +262,11 @@ def test_rows_beyond_the_scan_are_empty():
 
 @pytest.mark.parametrize("resampler", ["grid_sample", pytest.param("opencv", marks=pytest.mark.slow)])
 def test_an_overview_of_many_lines_a_cell_is_the_same_in_any_strips(resampler):
-    lines, pitch = 12_000, 20 * PITCH
-    motion, scan = motion_of((0.03, 1.01, -0.02)), scan_of(torch.full((lines, RIG.width_px), DEPTH), Travel(PITCH))
+    lines, pitch, narrow = 12_000, 20 * PITCH, dataclasses.replace(RIG, width_px=100)
+    motion, scan = (
+        motion_of(0.03, 1.01, -0.02),
+        scan_of(torch.full((lines, narrow.width_px), DEPTH), Travel(PITCH), narrow),
+    )
     config = dataclasses.replace(CONFIG, pitch_mm=pitch, resampler=resampler)
     made = []
     for rows in (64, 10_000):

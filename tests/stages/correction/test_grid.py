@@ -14,7 +14,8 @@ from lsvision.stages.correction.correct import Correction
 from lsvision.stages.correction.grid import most_lines, plan_product, source_dtype
 from lsvision.stages.correction.locate import Locator
 from lsvision.stages.disparity.depth import depth_of
-from lsvision.types import DepthView, Motion, Rig, Scan, Travel
+from lsvision.types import DepthView, Rig, Scan, Travel
+from tests.stages.rendered import motion_of
 
 RIG = Rig(64, 1120.0, 113.84, 354.0, 8.8, 54.0)
 CONFIG = CorrectionConfig(height_range_mm=(-20.0, 20.0))
@@ -35,10 +36,6 @@ class Endless:
 def scan_of(lines: int, travel: Travel, rig: Rig = RIG) -> Scan:
     left = Endless((lines, rig.width_px, 1), 100, torch.uint8)
     return Scan(Path("s"), rig, travel, DepthView(left, Endless(left.shape, zero_disparity_mm(rig), torch.float32)))
-
-
-def motion_of(*n: float) -> Motion:
-    return Motion(torch.tensor(n, dtype=torch.float64), torch.zeros(3, 3, dtype=torch.float64))
 
 
 WOBBLING = Travel(7.8, 7.8 * torch.arange(500).double() + 3.0 * torch.sin(torch.arange(500).double() / 7))
