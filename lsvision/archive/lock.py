@@ -69,10 +69,10 @@ def _acquire(lock: FileLock) -> None:
     """Make a lock's folder and take the lock; the run before, ending, may remove the folder between the two."""
     folder = Path(lock.lock_file).parent
     for trial in range(_TRIALS):
-        folder.mkdir(parents=True, exist_ok=True)
         try:
+            folder.mkdir(parents=True, exist_ok=True)
             lock.acquire(timeout=_PATIENCE_S, poll_interval=_POLL_S)
-        except FileNotFoundError:
+        except (FileNotFoundError, FileExistsError):  # the latter where it was there, and is gone at a second look
             if trial == _TRIALS - 1:
                 raise
         else:
