@@ -6,6 +6,7 @@ import os
 import signal
 import sys
 import threading
+import time
 from collections import deque
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
@@ -20,6 +21,8 @@ from lsvision.errors import LsvisionError
 from lsvision.interruption import hidden_from_children, start_resource_tracker, uninterrupted
 
 StartMethod = Literal["forkserver", "spawn"]
+
+_PAUSE_S = 1e-3  # after a first worker that did not start; each further one, twice as long
 
 log = logging.getLogger(__name__)
 
@@ -134,6 +137,8 @@ class LocalEngine:
         self._failed_starts += 1
         if self._failed_starts > MAX_FAILED_STARTS:
             raise LsvisionError(f"workers do not start: {self._failed_starts} of them ended before their first task")
+        # A server that was killed is found dead, and started anew, only when the system has ended it.
+        time.sleep(_PAUSE_S * 2 ** (self._failed_starts - 1))
 
     def _replace(self, pool: ProcessPoolExecutor) -> None:
         pool.shutdown(wait=False)

@@ -11,6 +11,7 @@ import psutil
 import pytest
 
 from lsvision.archive import LocalEngine
+from lsvision.archive.engines import local
 from lsvision.archive.tasks import Task
 from lsvision.errors import LsvisionError
 from tests.archive.engines.test_engine import Number, collected
@@ -63,5 +64,6 @@ def test_workers_that_never_start_are_one_line(monkeypatch, error):
         raise error
 
     monkeypatch.setattr(multiprocessing.forkserver, "connect_to_new_process", refuse)
+    monkeypatch.setattr(local, "_PAUSE_S", 0.0)
     with pytest.raises(LsvisionError, match="workers do not start: 11 of them ended before their first task"):
         LocalEngine(1)
