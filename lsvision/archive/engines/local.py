@@ -134,6 +134,7 @@ class LocalEngine:
         return None
 
     def _count_failed_start(self) -> None:
+        """Count a worker that did not start, and wait a moment before the next."""
         self._failed_starts += 1
         if self._failed_starts > MAX_FAILED_STARTS:
             raise LsvisionError(f"workers do not start: {self._failed_starts} of them ended before their first task")

@@ -48,10 +48,11 @@ class GainEquations:
         """
         width = weight.shape[1]
         known = _by_lag(weight[..., None], wander_px)
-        count = _sheared(known).sum(0).clamp(min=1e-9)
+        on_pattern = _sheared(known)
+        count = on_pattern.sum(0).clamp(min=1e-9)
         pattern = _sheared(_by_lag(sums, wander_px)).sum(0) / count
         explained = torch.einsum("luo,lcu->uc", known, pattern.unfold(0, width, 1))
-        root = (_sheared(known) / count.sqrt())[..., 0]
+        root = (on_pattern / count.sqrt())[..., 0]
         band = -torch.stack([_correlated(root, lag, width) for lag in range(len(root))])
         band[0] += weight.sum(0)
         return cls(band, sums.sum(0) - explained, weight.sum(0), (weight > 0).sum(0).to(weight))

@@ -62,7 +62,7 @@ class RigSolution:
     outliers: Int[Tensor, "*batch boards"]
     found: BorderedFit
     noise_scale: Float[Tensor, "*batch"]
-    along: "SharedErrors | None" = None
+    along: SharedErrors | None = None
 
     @property
     def shared(self) -> Shared:
@@ -186,7 +186,7 @@ def fit_rig(
     start: BorderedState,
     weight: Float[Tensor, "*batch boards corners"],
     config: RigConfig,
-    along: "SharedErrors | None" = None,
+    along: SharedErrors | None = None,
 ) -> BorderedFit:
     """Estimate rig, motion and poses from corners; ``weight`` is what each residual in sigmas is multiplied by.
 

@@ -3,8 +3,9 @@
 The kernels' variances say roughly where waves are. Each begins there, with broad-band kernels beside it, and its
 frequency follows the gradient of the restricted likelihood: it ends up known to some thousandths of a wave per board,
 where a kernel is known to a tenth. What two waves beat like is first taken for one: where what the waves leave shows
-another frequency, a further wave is tried. Waves are kept where they make the data more probable than kernels alone,
-the freedom of their frequencies allowed for.
+another frequency, a further wave is tried, and so are two in place of each long one. Two of nearly one frequency, as
+components have that begin apart, are tried as one. Waves are kept where they make the data more probable than kernels
+alone, the freedom of their frequencies allowed for.
 
 Source: Solin & Särkkä 2014; MacKay 2003, Information Theory, Inference, and Learning Algorithms, ch. 28.
 """
