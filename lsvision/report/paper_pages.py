@@ -208,6 +208,7 @@ def sheet_table(scenarios: Mapping[str, Scenario]) -> Table:
         "The sheet against its artwork",
         ("scenario", "corrected", "error [mm rms]", "across [mm rms]", "along [mm rms]", "in depth [mm rms]"),
         rows,
-        "The profile of a flat sheet shows by how much each line is displaced in depth and rolled. It is the same "
-        "wherever a line lies sideways or along the travel: these are not observed, and stay. A log shows them.",
+        "The profile of a flat sheet shows by how much each line is displaced in depth and rolled. Its straight edges "
+        "along the travel show by how much sideways, but for the trend, which looks like a sheared sheet. Displacement "
+        "along the travel is not observed, and stays. A log shows all of it.",
     )
