@@ -26,7 +26,7 @@ from lsvision.geometry import scaled_rig, without_trend
 from lsvision.image.tiling import keep_freed_memory
 from lsvision.io import NewScan, Product, write_calibration, write_line_motion, write_scan
 from lsvision.simulation import Acquisition, MotionConfig, SceneConfig, SensorConfig, Simulation, simulate
-from lsvision.simulation.sheet_points import SheetPoints, points_in_product
+from lsvision.simulation.sheet_points import points_in_product
 from lsvision.stages.line_motion.config import LineMotionConfig
 from lsvision.types import Board, Calibration, LineMotion, Motion, Observability, TensorImage
 
@@ -76,18 +76,7 @@ class Off:
         rows = product.shape[0]
         color, height = TensorImage(product.color(0, rows)), TensorImage(product.height(0, rows)[..., None])
         points = points_in_product(color, height, product.grid, made.trajectory.n, made)
-        return cls(points.rms_mm, without_shear(points))
-
-
-def without_shear(points: SheetPoints) -> float:
-    """Rms error of points, but for a change of the pose and a shear of x by y."""
-    x, y, _ = (points.true_mm - points.true_mm.mean(0)).T
-    none, one = torch.zeros_like(x), torch.ones_like(x)
-    moves = [(one, none, none), (none, one, none), (none, none, one), (none, none, x), (none, none, y), (-y, x, none)]
-    design = torch.stack([torch.stack(move) for move in (*moves, (y, none, none))], -1).flatten(0, 1)
-    error = (points.measured_mm - points.true_mm).T.reshape(-1, 1)
-    left = error - design @ torch.linalg.lstsq(design, error).solution
-    return float((left.square().sum() / len(x)).sqrt())
+        return cls(points.rms_mm, points.unsheared_rms_mm)
 
 
 def true_motion(folder: Path, made: Simulation) -> LineMotionChoice:

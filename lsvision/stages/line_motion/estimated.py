@@ -9,8 +9,11 @@ from torch import Tensor
 from lsvision.geometry import ProductFrame, travel_at, without_trend
 from lsvision.stages.line_motion.config import LineMotionConfig
 from lsvision.stages.line_motion.estimate import estimate, noisy_values
+from lsvision.stages.line_motion.register import Registered
 from lsvision.stages.line_motion.registration import RegisteredScan
 from lsvision.types import LineFinding, LineMotion
+
+_STEP_MM, _FEW = 3.0, 0.15  # between neighbouring lines; share of the lines
 
 
 @dataclass(frozen=True)
@@ -39,7 +42,9 @@ class Estimated:
         """
         lines = registered.lines
         along = travel_at(frame.travel, torch.arange(len(lines.values)).double())
-        gauged = lines if level is None else replace(lines, values=lines.values - level)
+        gauged = (
+            lines if level is None else _of_one_object(replace(lines, values=lines.values - level), samples, config)
+        )
         motion = estimate(gauged, samples, along, registered.errors, config)
         return cls(registered, along, noisy_values(gauged, samples, config).valid, motion)
 
@@ -47,6 +52,19 @@ class Estimated:
         """With another finding about δx."""
         findings = finding, *self.motion.findings[1:]
         return replace(self, motion=replace(self.motion, findings=findings))
+
+
+def _of_one_object(lines: Registered, samples: int, config: LineMotionConfig) -> Registered:
+    """Lines without those before or behind a step in depth, of which there are few: they show another object.
+
+    As seen from a tilted sheet, the conveyor at one of its ends may lie no further off than a motion reaches.
+    """
+    shown = noisy_values(lines, samples, config).valid.nonzero()[:, 0]
+    part = torch.cat([shown.new_zeros(1), (lines.values[shown, 1].diff().abs() > _STEP_MM).long().cumsum(0)])[
+        : len(shown)
+    ]
+    few = torch.bincount(part) < _FEW * len(shown)
+    return replace(lines, samples=lines.samples.index_fill(0, shown[few[part]], 0))
 
 
 def level_of(

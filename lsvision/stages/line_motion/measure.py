@@ -81,7 +81,7 @@ def measure_line_motion(
         return LineMeasurement(not_measured(depth.lines, "no profile that half of the lines show was measured"))
     registered = register_scan(frame, depth, shown.reference, shown.columns, config)
     seen = Estimated.of(registered, shown.samples, frame, config)
-    if config.straight_edges and seen.motion.findings[0].state == "not observed":
+    if config.straight_edges:
         seen = measure_flat(scan, depth, (shown.reference, shown.columns), seen, frame, config)
     found, lines, valid = seen.motion, seen.registered.lines, seen.valid
     pair = _colors(scan, frame, shown.place(lines.values[:, 1] * valid, found, frame))

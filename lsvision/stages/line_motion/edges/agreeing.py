@@ -20,7 +20,9 @@ from lsvision.stages.line_motion.edges.common import (
     shape_length_mm,
 )
 
-_BESIDE_MM = 5.0  # of the profile's ends, within which an edge is the object's outline: depth is not measured there
+_BESIDE_MM = (
+    15.0  # of the profile's ends, within which an edge is the object's side: it is slanted, and depth fails there
+)
 _LEAST_ALIKE, _MOST_APART_CELLS = 0.5, 1.0  # contrast and shift of an edge's picture in the right image
 _TRACK_CELLS = 0.75  # median distance of two tracks that agree
 _LEAST_CONTRAST = 0.3  # of the mean picture's, with which a line shows an edge

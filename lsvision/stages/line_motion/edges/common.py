@@ -23,9 +23,10 @@ from lsvision.stages.line_motion.edges.tracks import Tracks
 
 _ROUNDS = 5
 _SMOOTHED_CELLS, _SHAPE_CELLS = 16.0, 64.0  # standard deviations, over the travel, of δx between rounds and of shapes
+_TAIL = 3.0  # standard deviations, at which the Gaussian is cut off
 _CUT = 3.0  # standard deviations, beyond which an edge counts less on a line
 _LEAST_INFORMATION = 1e-4  # of contrast squared
-_FORGOTTEN, _LEAST_MEMORY, _LONGEST = 0.1, 0.3, 100  # correlation, lines
+_FORGOTTEN, _LEAST_MEMORY, _LONGEST = 0.05, 0.3, 100  # correlation, lines
 _LEVER_STEPS = (1e-2, 1e-2, 1e-4)  # mm, mm, rad
 
 
@@ -71,7 +72,7 @@ class EdgeLines:
         weight = weight * self.used
         both = torch.stack([weight * values, weight])
         sigma = length_mm / self.advance_mm
-        offset = torch.arange(-round(3 * sigma), round(3 * sigma) + 1).to(values)
+        offset = torch.arange(-round(_TAIL * sigma), round(_TAIL * sigma) + 1).to(values)
         kernel = torch.exp(-0.5 * (offset / sigma).square())
         flat = F.conv1d(both.flatten(0, -2)[:, None], kernel[None, None], padding=len(offset) // 2)[:, 0]
         total, weights = flat.view_as(both)
@@ -112,8 +113,8 @@ class EdgeFit:
         return (self.off - self.mean_off) * (self.weight / (1 - share).clamp(min=1e-6)).sqrt()
 
     def scale(self, lines: EdgeLines) -> float:
-        """True errors over those that the weights state."""
-        return float(self.left[:, lines.used].square().mean().sqrt())
+        """True errors over those that the weights state; 1 at least, as weights of what is off make it look smaller."""
+        return max(1.0, float(self.left[:, lines.used].square().mean().sqrt()))
 
     def shapes(self, lines: EdgeLines, length_mm: float) -> Float[Tensor, " edges"]:
         """How far each edge departs from the others over long distances, mm rms."""

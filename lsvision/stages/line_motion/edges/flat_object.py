@@ -16,8 +16,8 @@ from lsvision.stages.line_motion.profiles import Reference
 
 _LEAST_WIDTH_MM = 10.0  # of a piece of the profile
 _STEP_MM = 1.0  # between neighbouring nodes of the profile, beyond which one piece ends
-_FLAT_MM = 0.5  # from a straight line, within which nine tenths of a flat profile lie
-_MOST = 0.9
+_FLAT_MM, _MOST = 0.5, 0.75  # from a straight line, within which most of a flat profile lies
+_ALONE = 0.9  # of a profile, that is most of it
 _CUT, _ROUNDS = 4.0, 5  # robust standard deviations of heights that count for the line
 
 
@@ -25,7 +25,8 @@ _CUT, _ROUNDS = 4.0, 5  # robust standard deviations of heights that count for t
 class FlatObject:
     """A flat object in the product: its height at q_x = 0 and its slope, and from where to where it lies, mm.
 
-    ``profile`` is its piece of the reference, which says that sideways motion does not show.
+    ``profile`` is its piece of the reference, which says that sideways motion does not show. ``is_alone`` states
+    whether that is most of the reference.
     """
 
     frame: ProductFrame
@@ -34,6 +35,7 @@ class FlatObject:
     low_mm: float
     high_mm: float
     profile: Reference
+    is_alone: bool
 
     @classmethod
     def of(cls, reference: Reference, frame: ProductFrame) -> "FlatObject | None":
@@ -49,12 +51,16 @@ class FlatObject:
             line = torch.linalg.lstsq(design[kept], height[kept, None]).solution[:, 0]
             off = (height - design @ line).abs()
             kept = off <= _CUT * NORMAL_OVER_MAD * off.median() + 1e-9
-        if float(off.quantile(_MOST)) > _FLAT_MM:
+        within = off <= _FLAT_MM
+        if float(within.double().mean()) < _MOST:
             return None
+        piece[piece.clone()] = within
+        x = x[within]
         alone = reference.height.masked_fill(~piece, torch.nan)
         flat = torch.where(piece, 0.0, torch.nan).to(alone)
         profile = Reference(reference.origin_mm, reference.step_mm, alone, flat)
-        return cls(frame, float(line[0]), float(line[1]), float(x[0]), float(x[-1]), profile)
+        is_alone = float(piece.sum()) >= _ALONE * float(reference.height.isfinite().sum())
+        return cls(frame, float(line[0]), float(line[1]), float(x[0]), float(x[-1]), profile, is_alone)
 
     def across(
         self, left_px: Float[Tensor, "*batch lines"], motion: Float[Tensor, "lines 4"]

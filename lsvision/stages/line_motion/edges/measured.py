@@ -105,23 +105,24 @@ def _on_all_lines(result: Agreed, seen: EdgeLines, lines: range, count: int) -> 
     )
 
 
-def with_edges(edges: EdgeMotion, profile: RegisteredScan, flat: FlatObject) -> RegisteredScan:
-    """Join what edges show with what the profile does, which is sure of δz + slope δx alone."""
+def with_edges(edges: EdgeMotion | None, profile: RegisteredScan, flat: FlatObject) -> RegisteredScan:
+    """Join what edges show, if anything, with what the profile does, which is sure of δz + slope δx alone."""
     lines, errors = profile.lines, profile.errors
     loose = torch.diag(lines.values.new_tensor(LOOSE_SIGMA) ** -2)  # that registered lines count beside their own
     scale, ridge = errors.scale[1:], torch.eye(3).to(loose)
     ridge[1, 0] = -flat.slope
     apart = torch.zeros_like(lines.information)
-    apart[:, 0, 0] = edges.variance
+    apart[:, 0, 0] = LOOSE_SIGMA[0] ** 2 if edges is None else edges.variance
     apart[:, 1:, 1:] = scale[:, None] * torch.linalg.inv((lines.information + loose)[:, 1:, 1:]) * scale
-    values = torch.stack([edges.dx, *lines.values.T[1:]], 1)
-    values[:, 1] -= flat.slope * (edges.dx - lines.values[:, 0])
+    dx = torch.zeros_like(lines.values[:, 0]) if edges is None else edges.dx
+    values = torch.stack([dx, *lines.values.T[1:]], 1)
+    values[:, 1] -= flat.slope * (dx - lines.values[:, 0])
     information = torch.linalg.inv(ridge @ apart @ ridge.T) - loose
     rms, memory = errors.rms.clone(), errors.memory.clone()
-    rms[0], memory[0] = edges.variance[edges.seen].median().sqrt(), edges.memory
-    return RegisteredScan(
-        replace(lines, values=values, information=information), LineErrors(torch.ones_like(rms), memory, rms)
-    )
+    rms[0] = LOOSE_SIGMA[0] if edges is None else edges.variance[edges.seen].median().sqrt()
+    memory[0] = memory[1] if edges is None else edges.memory
+    lines = replace(lines, values=values, information=information)
+    return RegisteredScan(lines, LineErrors(torch.ones_like(rms), memory, rms))
 
 
 def with_profile_errors(motion: LineMotion, edges: EdgeMotion) -> LineMotion:

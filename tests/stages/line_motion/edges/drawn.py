@@ -45,7 +45,7 @@ def sheet(dx: Tensor, left: float = 0.0, right: float = 300.0, per_line_mm: floa
     return Stripe(along(left, dx, per_line_mm), along(right, dx, per_line_mm), 130.0)
 
 
-def scan_of(stripes: list[Stripe], seed: int = 0) -> tuple[Scan, StoredDepth]:
+def scan_of(stripes: list[Stripe], seed: int = 0, noise: float = 3.0) -> tuple[Scan, StoredDepth]:
     """Both images and the depth of stripes over a conveyor, with noise."""
     generator = torch.Generator().manual_seed(seed)
     images = []
@@ -57,7 +57,7 @@ def scan_of(stripes: list[Stripe], seed: int = 0) -> tuple[Scan, StoredDepth]:
             image = torch.lerp(
                 image, torch.full_like(image, stripe.brightness), covered(stripe, origin + slope * stripe.z)
             )
-        image = image + 3.0 * torch.randn(image.shape, generator=generator)
+        image = image + noise * torch.randn(image.shape, generator=generator)
         images.append(TensorImage(image.round().clamp(0, 255).to(torch.uint8)[..., None]))
     slope = slope_at(RIG, torch.arange(RIG.width_px).double())
     z = torch.full((LINES, RIG.width_px), Z + BELOW).double()

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from lsvision.geometry import slope_at
-from lsvision.stages.line_motion import measure
+from lsvision.stages.line_motion import flat, measure
 from lsvision.stages.line_motion.edges import measured as edges
 from lsvision.types import Motion, TensorImage
 from tests.stages.line_motion.edges.drawn import (
@@ -43,7 +43,8 @@ def test_two_sides_show_it_as_well_as_their_sigma_says(per_line_mm: float) -> No
     dx = shaken()
     found = measured([sheet(dx, per_line_mm=per_line_mm)])
     assert (found.findings[0].state, found.findings[0].edges) == ("corrected", 2)
-    assert "known to 0.006 mm, from 2 straight edges along the travel" in found.findings[0].in_words
+    assert found.findings[0].sigma == pytest.approx(0.006, abs=0.001)
+    assert "from 2 straight edges along the travel" in found.findings[0].in_words
     assert rms(errors_of(found, dx) * found.sigma[:, 0]) < 0.01
     assert 0.6 < rms(errors_of(found, dx)) < 1.25
 
@@ -62,7 +63,7 @@ def test_a_still_sheet_stays_to_the_bit() -> None:
         ([sheet(shaken(), -500.0, 900.0)], "fewer than two straight edges along the travel show it"),
         (
             [Stripe(along(0.0, shaken()), along(300.0, shaken() + ((LINE - 200) / 200) ** 2), 130.0)],
-            "two edges along the travel contradict each other by 0.18 mm",
+            "two edges along the travel contradict each other by 0.17 mm",
         ),
         (  # a shadow that stands still
             [sheet(shaken()), Stripe(STANDING + 140, STANDING + 160, 220.0)],
@@ -103,7 +104,7 @@ def test_edges_are_not_looked_for_where_the_profile_shows_it(monkeypatch: pytest
     def none_of_it(*_: object) -> None:
         raise AssertionError("edges of an object whose profile shows δx")
 
-    monkeypatch.setattr(measure, "measure_flat", none_of_it)
+    monkeypatch.setattr(flat, "measure_edges", none_of_it)
     scan, depth = scan_of([sheet(shaken(0.0))])
     x = slope_at(RIG, torch.arange(RIG.width_px).double()) * Z
     round_ = Z + ((x - 150.0) / 8.0).square() / 8
