@@ -6,10 +6,10 @@ with it: the steps to it are no profile of the object. The trend of a pitched sh
 
 from dataclasses import replace
 
-from lsvision.geometry import ProductFrame
+from lsvision.geometry import ProductFrame, without_trend
 from lsvision.stages.line_motion.config import LineMotionConfig
 from lsvision.stages.line_motion.edges.flat_object import FlatObject
-from lsvision.stages.line_motion.edges.measured import measure_edges, with_edges, with_profile_errors
+from lsvision.stages.line_motion.edges.measured import finished, measure_edges, with_edges
 from lsvision.stages.line_motion.estimated import Estimated, level_of
 from lsvision.stages.line_motion.profiles import Reference
 from lsvision.stages.line_motion.registration import register_scan
@@ -44,5 +44,5 @@ def measure_flat(
         sideways = alone.motion.findings[0]
         return alone.with_finding(replace(sideways, sigma=0.0, reason=f"{edges}, and {sideways.reason}"))
     both = Estimated.of(with_edges(edges, registered, flat), samples, frame, config, level)
-    both = replace(both, motion=with_profile_errors(both.motion, edges))
-    return both.with_finding(replace(both.motion.findings[0], edges=edges.count))
+    gauge = without_trend(both.along, both.valid & edges.seen)
+    return replace(both, motion=finished(both.motion, edges, gauge))

@@ -12,20 +12,14 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from lsvision.stages.line_motion.config import LineMotionConfig
-from lsvision.stages.line_motion.edges.common import (
-    CommonMotion,
-    EdgeFit,
-    EdgeLines,
-    robust_straight,
-    shape_length_mm,
-)
+from lsvision.stages.line_motion.edges.common import CommonMotion, EdgeFit, shape_length_mm
+from lsvision.stages.line_motion.edges.edge_lines import EdgeLines, robust_straight
 
 _BESIDE_MM = (
     15.0  # of the profile's ends, within which an edge is the object's side: it is slanted, and depth fails there
 )
 _LEAST_ALIKE, _MOST_APART_CELLS = 0.5, 1.0  # contrast and shift of an edge's picture in the right image
 _TRACK_CELLS = 0.75  # median distance of two tracks that agree
-_LEAST_CONTRAST = 0.3  # of the mean picture's, with which a line shows an edge
 
 
 _TOO_FEW = "fewer than two straight edges along the travel show it"
@@ -45,15 +39,14 @@ def agreed(common: CommonMotion, config: LineMotionConfig) -> Agreed | str:
     Those that depart from the others once all are fitted must be fewer than those that are left.
     """
     on_it = _on_object(common)
-    group = largest_group(common.place[on_it], common.lines, _TRACK_CELLS * common.cells.pitch_mm)
+    on_it &= common.there.sum(1) >= config.edge_share * common.lines.used.sum()
+    within_mm = _TRACK_CELLS * common.cells.pitch_mm
+    group = largest_group(common.place[on_it], common.there[on_it], common.lines, within_mm)
     edges, against, departs = on_it.nonzero()[group.members, 0], group.rivals, 0.0
     while len(edges) >= 2:
         fit = common.among(edges).fit()
         off = fit.shapes(common.lines, shape_length_mm(common.cells))
-        seen = (fit.contrast[:, common.lines.used] > _LEAST_CONTRAST).double().mean(1)
-        if bool((seen < config.edge_share).any()):
-            edges = edges[seen > seen.min()]
-        elif float(off.max()) > config.edges_within_mm:
+        if float(off.max()) > config.edges_within_mm:
             departs, against = float(off.max()), against + 1
             edges = edges[off < off.max()]
         elif against >= len(edges):
@@ -81,15 +74,19 @@ class Group:
     rivals: int
 
 
-def largest_group(place: Float[Tensor, "tracks lines"], lines: EdgeLines, within_mm: float) -> Group:
+def largest_group(
+    place: Float[Tensor, "tracks lines"], there: Bool[Tensor, "tracks lines"], lines: EdgeLines, within_mm: float
+) -> Group:
     """The tracks of the largest group of which one agrees with all others.
 
     Args:
+        there: on which lines tracks follow an edge.
         within_mm: median distance of two tracks over the lines, but for a straight line, up to which they agree.
     """
-    pairs = (place[:, None] - place).flatten(0, 1)
-    off = (pairs - robust_straight(pairs, lines) @ lines.design.T)[:, lines.used].abs().median(1).values
-    agree = off.view(len(place), len(place)) <= within_mm
+    pairs, both = (place[:, None] - place).flatten(0, 1), (there[:, None] & there).flatten(0, 1)
+    off = (pairs - robust_straight(pairs, lines, both.to(pairs)) @ lines.design.T).abs()
+    middle = off.masked_fill(~both, torch.nan).nanmedian(1).values
+    agree = middle.view(len(place), len(place)) <= within_mm
     if not len(place) or int(agree.sum(1).max()) < 2:
         return Group(torch.zeros(0).long(), 0)
     best = agree[int(agree.sum(1).argmax())]

@@ -5,6 +5,7 @@
 3. Joined with what the profile of the object alone shows of δz and roll, for the smoother.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
@@ -18,7 +19,8 @@ from lsvision.stages.disparity.depth import relation_of_scan
 from lsvision.stages.line_motion.config import LineMotionConfig
 from lsvision.stages.line_motion.edges.agreeing import Agreed, agreed
 from lsvision.stages.line_motion.edges.cells import Cells
-from lsvision.stages.line_motion.edges.common import CommonMotion, EdgeFit, EdgeLines
+from lsvision.stages.line_motion.edges.common import CommonMotion, EdgeFit
+from lsvision.stages.line_motion.edges.edge_lines import EdgeLines
 from lsvision.stages.line_motion.edges.flat_object import FlatObject
 from lsvision.stages.line_motion.edges.tracks import find_tracks
 from lsvision.stages.line_motion.errors import LineErrors
@@ -94,12 +96,11 @@ def _on_all_lines(result: Agreed, seen: EdgeLines, lines: range, count: int) -> 
     fit: EdgeFit = result.fit
     around = (lines.start, count - lines.stop)
     loosest = LOOSE_SIGMA[0] ** 2
-    variance = (fit.scale(seen) ** 2 / fit.total).clamp(max=loosest).masked_fill(~seen.used, loosest)
-    dx = (fit.dx + fit.mean_off).masked_fill(~seen.used, 0.0)
+    variance = (fit.scale**2 / fit.total).clamp(max=loosest)
     return EdgeMotion(
-        dx=pad(dx, around),
+        dx=pad(fit.dx + fit.mean_off, around),
         variance=pad(variance, around, value=loosest),
-        memory=fit.memory(seen),
+        memory=fit.memory,
         lever=pad(fit.lever, (0, 0, *around)),
         count=result.count,
     )
@@ -125,13 +126,23 @@ def with_edges(edges: EdgeMotion | None, profile: RegisteredScan, flat: FlatObje
     return RegisteredScan(lines, LineErrors(torch.ones_like(rms), memory, rms))
 
 
-def with_profile_errors(motion: LineMotion, edges: EdgeMotion) -> LineMotion:
-    """With what δx errs by because the edges lie at another depth, or are rolled otherwise, than their profile says."""
-    if motion.findings[0].state != "corrected":
-        return motion
-    covariance = motion.covariance.clone()
-    across = (covariance[:, 1:3, 1:3] @ edges.lever[..., None])[..., 0]
-    covariance[:, 0, 0] += (edges.lever * across).sum(1)
-    covariance[:, 0, 1:3] += across
-    covariance[:, 1:3, 0] += across
-    return replace(motion, covariance=covariance)
+def finished(motion: LineMotion, edges: EdgeMotion, gauge: Callable[[Tensor], Tensor]) -> LineMotion:
+    """The motion with δx as edges show it.
+
+    It errs besides because the edges lie at another depth, or are rolled otherwise, than their profile says.
+
+    Args:
+        gauge: removes mean and trend over the lines that show edges.
+    """
+    sideways = replace(motion.findings[0], edges=edges.count)
+    if sideways.state == "corrected":
+        values, covariance = motion.values.clone(), motion.covariance.clone()
+        values[:, 0] = gauge(values[:, 0])
+        across = (covariance[:, 1:3, 1:3] @ edges.lever[..., None])[..., 0]
+        covariance[:, 0, 0] += (edges.lever * across).sum(1)
+        covariance[:, 0, 1:3] += across
+        covariance[:, 1:3, 0] += across
+        rms, variance = values[edges.seen, 0].square().mean().sqrt(), covariance[edges.seen, 0, 0].mean()
+        sideways = replace(sideways, rms=float(rms), sigma=float(variance.sqrt()))
+        motion = replace(motion, values=values, covariance=covariance)
+    return replace(motion, findings=(sideways, *motion.findings[1:]))

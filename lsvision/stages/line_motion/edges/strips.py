@@ -46,18 +46,18 @@ class Strips:
         """Those of some edges."""
         return Strips(self.first[:, edges], self.values[:, edges])
 
-    def shifts(self, place: Float[Tensor, "views edges lines"], used: Bool[Tensor, " lines"]) -> Shifts:
-        """Shifts of lines from places; the mean pictures are those of the lines ``used``."""
+    def shifts(self, place: Float[Tensor, "views edges lines"], there: Bool[Tensor, "edges lines"]) -> Shifts:
+        """Shifts of lines from places; the mean pictures are those of the lines on which an edge is ``there``."""
         seen = self._at(place)
-        known = _by_picture(seen[:, :, used].mean(2))
+        known = _by_picture(_mean(seen, there))
         found = torch.linalg.pinv(known) @ seen[..., _BESIDE:-_BESIDE].mT
         return Shifts(found[..., 1, :], -found[..., 2, :])
 
     def alike(
-        self, place: Float[Tensor, "views edges lines"], used: Bool[Tensor, " lines"]
+        self, place: Float[Tensor, "views edges lines"], there: Bool[Tensor, "edges lines"]
     ) -> Float[Tensor, "2 edges"]:
         """Contrast of the mean picture of edges in the right image over that in the left one, and its shift, cells."""
-        picture = self._at(place)[:, :, used].mean(2)
+        picture = _mean(self._at(place), there)
         seen = picture[1, :, _BESIDE:-_BESIDE, None]
         _, contrast, moved = (torch.linalg.pinv(_by_picture(picture[0])) @ seen)[..., 0].unbind(-1)
         return torch.stack([contrast, -moved / contrast])
@@ -65,8 +65,8 @@ class Strips:
     def _at(self, place: Float[Tensor, "views edges lines"]) -> Float[Tensor, "views edges lines wide"]:
         """Strips about places and what is beside them, by cubic convolution (Keys 1981)."""
         t = torch.arange(-_REACH_CELLS - _BESIDE, _REACH_CELLS + _BESIDE + 1).to(place)
-        at = (place - self.first)[..., None] + t
-        base = at.floor().clamp(1, self.values.shape[-1] - 3).long()
+        at = ((place - self.first)[..., None] + t).clamp(1, self.values.shape[-1] - 2)
+        base = at.floor().clamp(max=self.values.shape[-1] - 3).long()
         f = at - base
         weights = (
             ((-0.5 * f + 1.0) * f - 0.5) * f,
@@ -77,6 +77,12 @@ class Strips:
         values = self.values.to(place)
         taps = [weight * values.gather(-1, base + k - 1) for k, weight in enumerate(weights)]
         return torch.stack(taps).sum(0)
+
+
+def _mean(seen: Float[Tensor, "views edges lines wide"], there: Tensor) -> Float[Tensor, "views edges wide"]:
+    """Mean over the lines of every edge on which it is there."""
+    share = there.to(seen) / there.sum(1, keepdim=True).clamp(min=1)
+    return (share[..., None] * seen).sum(2)
 
 
 def _by_picture(picture: Float[Tensor, "*batch wide"]) -> Float[Tensor, "*batch strip 3"]:
