@@ -1,0 +1,88 @@
+"""The report of a surface."""
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+from lsvision.archive.inspection import Inspection
+from lsvision.io import Product, Surface
+from lsvision.report.pages import Headline, Page, Table, write_report
+from lsvision.report.surface_figures import gallery, profile_and_scatter, unrolled_map
+from lsvision.report.surface_words import candidates_in_words, marks_in_words, surface_words
+from lsvision.types import Candidate, MarkGroup
+
+_SHOWN, _LISTED = 24, 100  # candidates in the gallery and in the table
+
+
+def surface_report(product: Product, surface: Surface, inspection: Inspection, settings: dict, folder: Path) -> None:
+    """``report.html``: the unrolled map, the candidates as a table and a gallery, and marks that repeat."""
+    candidates, groups = inspection.marked.candidates, inspection.marked.groups
+    metadata, sigma = inspection.metadata, inspection.metadata["sound_sigma_mm"]
+    metres = metadata["length_mm"] / 1e3
+    shown = candidates[:_SHOWN]
+    page = Page(
+        title=f"Surface of {product.path.stem}",
+        lead=". ".join([*surface_words(metadata), *(marks_in_words(group) for group in groups)]),
+        headlines=[
+            Headline("Candidates", str(len(candidates)), candidates_in_words(candidates)),
+            Headline("A metre", f"{len(candidates) / metres:.1f}", f"of {metres:.2f} m"),
+            Headline("Marks that repeat", str(len(groups)), "groups"),
+            Headline("Scatter", f"{1e3 * sigma['smoothed']:.2g} um", "of sound surface, smoothed"),
+        ],
+        tables=[
+            *([_groups_table(groups)] if groups else []),
+            *([_candidates_table(candidates)] if candidates else []),
+        ],
+        figures=[
+            unrolled_map(surface, candidates, sigma["smoothed"]),
+            *([gallery(surface, shown)] if shown else []),
+            profile_and_scatter(inspection.plan),
+        ],
+        settings=settings,
+        provenance={"product": str(product.path)},
+    )
+    write_report(page, folder)
+
+
+def _candidates_table(candidates: Sequence[Candidate]) -> Table:
+    header = (
+        "no.", "kind", "along [mm]", "around [mm]", "side", "depth [um]", "size [mm]", "volume [mm³]", "contrast",
+        "over sigma", "group",
+    )  # fmt: skip
+    note = (
+        f"Those that stand out most, {min(len(candidates), _LISTED)} of {len(candidates)}; all of them, each quantity "
+        "with its standard deviation, are in defects.parquet, defects.csv and defects.geojson of the product's folder "
+        "surface. Depth is that of the deepest place, above zero outwards; the size is that of the ellipse "
+        "with the same second moments."
+    )
+    return Table("Candidates", header, [_row(number, one) for number, one in enumerate(candidates[:_LISTED], 1)], note)
+
+
+def _row(number: int, candidate: Candidate) -> tuple[str, ...]:
+    relief = candidate.kind != "color"
+    return (
+        str(number),
+        candidate.kind,
+        f"{candidate.along_mm:.2f}",
+        f"{candidate.around_mm:+.2f}",
+        candidate.side,
+        f"{1e3 * candidate.depth_mm:+.0f} ± {1e3 * candidate.depth_sigma_mm:.0f}" if relief else "",
+        f"{candidate.length_mm:.1f} x {candidate.width_mm:.1f}",
+        f"{candidate.volume_mm3:+.2f}" if relief else "",
+        f"{100 * candidate.contrast:+.0f} %",
+        f"{candidate.ratio:.0f}",
+        "" if candidate.group is None else str(candidate.group),
+    )
+
+
+def _groups_table(groups: Sequence[MarkGroup]) -> Table:
+    header = ("group", "kind", "marks", "turns", "period [mm]", "roll's diameter [mm]", "around [mm]", "depth [um]")
+    rows = [
+        (
+            str(group.number), group.kind, str(group.marks), str(group.turns),
+            f"{group.period_mm:.2f} ± {group.period_sigma_mm:.2g}", f"{group.period_mm / math.pi:.2f}",
+            f"{group.around_mm:+.1f}", f"{1e3 * group.depth_mm:+.0f}",
+        )
+        for group in groups
+    ]  # fmt: skip
+    return Table("Marks that repeat", header, rows, "A damaged roll leaves a mark at each turn.")
