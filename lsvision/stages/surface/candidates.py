@@ -46,9 +46,10 @@ class Measuring:
             return _Depth(of["peak_value"], float(self.sound.smooth_mm.median()))
         narrow = [index for index in fits if self.fits[index].radius_mm <= wide]
         chosen = max(narrow) if narrow else min(fits)
-        # Where it is dark, noise of the grey values moves the match further.
         bright = min(max(1 + of["peak_contrast"], _DARKEST), 1.0) if math.isfinite(of["peak_contrast"]) else 1.0
-        return _Depth(of[f"fit_{chosen}"], float(self.sound.fitted_mm[chosen]) / bright)
+        # Half of the variance is noise of the grey values, which moves the match further where these are dark.
+        darker = math.sqrt((1 + bright**-2) / 2)
+        return _Depth(of[f"fit_{chosen}"], darker * float(self.sound.fitted_mm[chosen]))
 
     def _candidate(self, kind: CandidateKind, of: Mapping[str, float]) -> Candidate:
         pitch, sound, cells = self.grid.pitch_mm, self.sound, of["cells"]

@@ -16,10 +16,14 @@ class SurfaceConfig(Checked):
 
     Deviations are smoothed by a Gaussian of the standard deviation ``smoothing_mm``. A candidate is a connected place
     beyond ``low_sigma`` standard deviations of sound surface that somewhere exceeds ``high_sigma`` and
-    ``least_depth_mm``, and is ``least_area_mm2`` large. Places beyond ``color_low_sigma`` and somewhere
-    ``color_high_sigma`` in relative brightness, which at least departs by ``least_contrast``, are candidates by their
-    colour alone. Within ``margin_mm`` of the ends and gaps of the profile, where windows of the matching see more than
-    one height, nothing is looked for. The ``most_candidates`` that stand out most are kept.
+    ``least_depth_mm``, and is ``least_area_mm2`` large. Its depth is that of a paraboloid about its deepest place, and
+    makes good what the windows of the matching blur: ``matching_blur`` cells of the product (standard deviation), as
+    measured on rendered pits with a ``refine_window`` of 9 px; 0 for depths of the camera's own.
+
+    Places beyond ``color_low_sigma`` and somewhere ``color_high_sigma`` in relative brightness, which at least departs
+    by ``least_contrast``, are candidates by their colour alone. Within ``margin_mm`` of the ends and gaps of the
+    profile, where windows of the matching see more than one height, nothing is looked for. The ``most_candidates`` that
+    stand out most are kept.
 
     Marks repeat where at least ``least_marks`` of one kind follow each other at the same place around the object, to
     ``mark_tolerance_mm``, with a period within ``mark_period_mm``.
@@ -38,6 +42,7 @@ class SurfaceConfig(Checked):
     low_sigma: Positive = 3.0
     least_depth_mm: NonNegative = 0.03
     least_area_mm2: NonNegative = 2.0
+    matching_blur: NonNegative = 4.5
     color_high_sigma: Positive = 8.0
     color_low_sigma: Positive = 4.0
     least_contrast: NonNegative = 0.15

@@ -44,7 +44,10 @@ class SurfacePlan:
         """
         pitch = source.grid.pitch_mm
         profile = profile_of(source, config)
-        unrolling, smoothing = Unrolling.of(profile, pitch), Smoothing.of(config.smoothing_mm, pitch)
+        unrolling, smoothing = (
+            Unrolling.of(profile, pitch),
+            Smoothing.of(config.smoothing_mm, pitch, config.matching_blur),
+        )
         sound = sound_surface(source, profile, unrolling, smoothing, config)
         return cls(profile, unrolling, smoothing, sound, ~near_ends(profile, unrolling, config.margin_mm))
 

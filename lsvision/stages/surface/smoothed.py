@@ -28,9 +28,9 @@ class Smoothing:
     fits: tuple["Paraboloid", ...]
 
     @classmethod
-    def of(cls, smoothing_mm: float, pitch_mm: float) -> "Smoothing":
-        """For cells of a size."""
-        return cls(smoothing_mm / pitch_mm, tuple(Paraboloid.of(radius, pitch_mm) for radius in _FIT_MM))
+    def of(cls, smoothing_mm: float, pitch_mm: float, blur: float) -> "Smoothing":
+        """For cells of a size, of depths that are blurred by a Gaussian of ``blur`` cells."""
+        return cls(smoothing_mm / pitch_mm, tuple(Paraboloid.of(radius, pitch_mm, blur) for radius in _FIT_MM))
 
     @property
     def radius(self) -> int:
@@ -70,15 +70,19 @@ def _normalised(
 class Paraboloid:
     """Least-squares paraboloids over a disc: ``weights`` are those of (1, y, x, y², xy, x²), zero outside the disc.
 
+    A Gaussian of the standard deviation ``blur`` raises the bottom of a hollow by blur² / 2 times the sum of its second
+    derivatives, which is taken off.
+
     Source: Savitzky and Golay (1964), in two dimensions.
     """
 
     radius_mm: float
     reach: int
     weights: Float[Tensor, "6 window"]
+    blur: float = 0.0
 
     @classmethod
-    def of(cls, radius_mm: float, pitch_mm: float) -> "Paraboloid":
+    def of(cls, radius_mm: float, pitch_mm: float, blur: float = 0.0) -> "Paraboloid":
         """For cells of a size."""
         radius = max(_LEAST_FIT, radius_mm / pitch_mm)
         reach = math.ceil(radius)
@@ -86,12 +90,12 @@ class Paraboloid:
         y, x = (of.flatten() for of in torch.meshgrid(steps, steps, indexing="ij"))
         inside = y.square() + x.square() <= radius**2
         design = torch.stack([torch.ones_like(x), y, x, y * y, x * y, x * x], -1) * inside[:, None]
-        return cls(radius_mm, reach, torch.linalg.pinv(design))
+        return cls(radius_mm, reach, torch.linalg.pinv(design), blur)
 
     def extreme(
         self, plane: Float[Tensor, "rows cells"], row: Int[Tensor, " places"], cell: Int[Tensor, " places"]
     ) -> Float[Tensor, " places"]:
-        """Value of the paraboloid at its vertex, which must lie within half the disc, else in the middle.
+        """Value of the paraboloid, unblurred, at its vertex, which must lie within half the disc, else in the middle.
 
         NaN where less than most of the disc was measured; what is missing of it takes the value of the rest's own fit.
         """
@@ -121,4 +125,5 @@ class Paraboloid:
         turn = 4 * yy * xx - xy.square()
         y, x = (xy * by_x - 2 * xx * by_y) / turn, (xy * by_y - 2 * yy * by_x) / turn
         near = (turn > 0) & (torch.hypot(y, x) <= self.reach / 2)
-        return torch.where(near, middle + (by_y * y + by_x * x) / 2, middle)
+        lowest = torch.where(near, middle + (by_y * y + by_x * x) / 2, middle)
+        return lowest - self.blur**2 * (yy + xx)
