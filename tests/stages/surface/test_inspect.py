@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import cv2
 import pytest
 import torch
 
@@ -10,7 +11,7 @@ from lsvision.stages.surface.config import SurfaceConfig
 from lsvision.stages.surface.inspect import SurfacePlan, find_candidates
 from tests.stages.surface.products import PITCH_MM, MemoryProduct, dented, places, rail
 
-CONFIG = SurfaceConfig(smoothing_mm=0.6)
+CONFIG = SurfaceConfig(smoothing_mm=0.6, matching_blur=0.0)
 
 
 def found(product, config=CONFIG, written=lambda strip: None):
@@ -32,6 +33,17 @@ def test_dents_and_bumps_are_found_where_they_are_as_deep_as_they_are(shaken_mm)
         assert one.depth_mm == pytest.approx(-depth, abs=0.012)
         assert one.volume_mm3 * depth < 0
         assert 4.0 < one.width_mm <= one.length_mm < 6.5
+
+
+@pytest.mark.parametrize(("blur", "off_mm"), [(2.0, 0.01), (0.0, 0.04)])
+def test_depth_makes_good_what_the_matching_blurs(blur, off_mm):
+    product = dented(rail(600, noise_mm=0.0), 60.0, 0.0, 3.0, 0.3)
+    rows = cv2.GaussianBlur(product.heights.numpy(), (13, 13), 2.0)
+    noise = 0.002 * torch.randn(rows.shape, generator=torch.Generator().manual_seed(0))
+    heights = torch.where(places(*rows.shape)[1].abs() < 22.0, torch.from_numpy(rows) + noise, torch.nan).float()
+    (one,) = found(replace(product, heights=heights), replace(CONFIG, matching_blur=blur))
+    assert abs(one.depth_mm + 0.3) < off_mm
+    assert (blur > 0) == (abs(one.depth_mm + 0.3) < 0.01)
 
 
 @pytest.mark.parametrize("seed", range(4))
