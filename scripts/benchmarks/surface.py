@@ -145,7 +145,7 @@ def run(*, full: bool = False, glossy: bool = False, length_mm: float = 1000.0, 
     cv2.setNumThreads(1)
     keep_freed_memory()
     scale = 1 if full else 4
-    scene = replace(SCENE, seed=seed, rail_gloss=1.0 if glossy else 0.0, lights="along" if glossy else "beside")
+    scene = replace(SCENE, seed=seed, rail_gloss=0.1 if glossy else 0.0, lights="along" if glossy else "beside")
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
         rail = rail_of(folder, scale, round(length_mm / PITCH_MM / scale), scene)

@@ -21,6 +21,7 @@ _CROWN_SHARE = 0.95  # of a row's heights that lie about its crown, or lower
 _ROUNDS = 3  # of aligning rows and taking their profile
 _STEEPEST = 2.5  # slope beyond which neighbouring cells see too little of the surface
 _SLOPE_REACH_MM = 0.4  # to either side of a place, over which its slope is taken
+_LEAST_MEASURED = 0.5  # of the places between the ends of a profile
 _READ_ROWS = 512
 
 
@@ -82,17 +83,28 @@ def profile_of(source: ProductSource, config: SurfaceConfig) -> SurfaceProfile:
     spans = _spans(grid, config)
     profiles = [_common(_rows_of(source, span), q_x, config) for span in spans]
     pieces = [(span, profile) for span, profile in zip(spans, profiles, strict=True) if profile is not None]
-    height = _common(torch.stack([profile for _, profile in pieces]), q_x, config) if pieces else None
-    slope = None if height is None else _slope(height, grid.pitch_mm)
+    whole = _whole(torch.stack([profile for _, profile in pieces]), q_x, config) if pieces else None
+    if whole is not None:
+        off = torch.stack([profile for _, profile in pieces])[:, whole.columns] - whole.height
+        place = whole.basis.placed(off)
+        of_it = place.isfinite().all(1) & (place[:, 0].abs() <= config.largest_mm)
+        if int(of_it.sum()) >= len(spans) / 2:
+            middles = torch.tensor([(span[0] + span[-1]) / 2 for span, _ in pieces], dtype=torch.float64)
+            return replace(whole, pieces=(off - whole.basis.raised(place))[of_it], middle_rows=middles[of_it])
+    raise NoProfileError("no profile that half of the product's length shows: there is nothing to compare rows with")
+
+
+def _whole(
+    pieces: Float[Tensor, "pieces columns"], q_x: Float[Tensor, " columns"], config: SurfaceConfig
+) -> SurfaceProfile | None:
+    """The profile that pieces have in common; None where that has more gaps than places."""
+    height = _common(pieces, q_x, config)
+    slope = None if height is None else _slope(height, float(q_x[1] - q_x[0]))
     if height is None or slope is None or not bool(slope.isfinite().any()):
-        raise NoProfileError("no profile that half of the product's rows show: there is nothing to compare them with")
+        return None
     shown = slope.isfinite().nonzero()[:, 0]
     whole = _bridged(q_x, slice(int(shown[0]), int(shown[-1]) + 1), height, slope)
-    off = torch.stack([profile for _, profile in pieces])[:, whole.columns] - whole.height
-    place = whole.basis.placed(off)
-    of_it = place.isfinite().all(1) & (place[:, 0].abs() <= config.largest_mm)
-    middles = torch.tensor([(span[0] + span[-1]) / 2 for span, _ in pieces], dtype=torch.float64)
-    return replace(whole, pieces=(off - whole.basis.raised(place))[of_it], middle_rows=middles[of_it])
+    return whole if float(whole.measured.double().mean()) >= _LEAST_MEASURED else None
 
 
 def _spans(grid: ProductGrid, config: SurfaceConfig) -> list[list[int]]:
