@@ -7,12 +7,15 @@ from typing import Any
 
 from lsvision.errors import LsvisionError
 from lsvision.image.tiling import one_torch_thread
-from lsvision.io import Product, surface_writer, write_candidates
+from lsvision.io import Product, read_section, surface_writer, write_candidates, write_wear
+from lsvision.stages.line_motion.config import LineMotionConfig
 from lsvision.stages.surface.config import SurfaceConfig
 from lsvision.stages.surface.inspect import SurfacePlan, find_candidates
 from lsvision.stages.surface.marks import MarkedSurface
 from lsvision.stages.surface.profile import NoProfileError
 from lsvision.stages.surface.strips import STRIP_ROWS, SurfaceStrip
+from lsvision.stages.surface.wear import worn
+from lsvision.types import SectionWear
 
 
 @dataclass(frozen=True)
@@ -23,6 +26,7 @@ class Inspection:
     metadata: dict[str, Any]
     marked: MarkedSurface
     plan: SurfacePlan
+    wear: list[SectionWear]
 
 
 def inspect_product(
@@ -35,8 +39,9 @@ def inspect_product(
 
     Raises:
         LsvisionError: it shows no profile.
-        FileFormatError: it is damaged.
+        FileFormatError: it is damaged, or the section cannot be read.
     """
+    section = None if config.reference == "scan" else read_section(config.reference)
     with one_torch_thread():
         try:
             plan = SurfacePlan.of(product, config)
@@ -52,7 +57,12 @@ def inspect_product(
 
             marked = find_candidates(product, plan, config, written)
             write_candidates(marked.candidates, rows.folder)
-    return Inspection(product.path / "surface", metadata, marked, plan)
+            wear = []
+            if section is not None:
+                scatter = float(plan.sound.smooth_mm.median())
+                wear = worn(plan.profile, section, product.grid, scatter, LineMotionConfig())
+                write_wear(wear, rows.folder)
+    return Inspection(product.path / "surface", metadata, marked, plan, wear)
 
 
 def _metadata(product: Product, plan: SurfacePlan, config: SurfaceConfig) -> dict[str, Any]:

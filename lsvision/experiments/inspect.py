@@ -12,7 +12,7 @@ from lsvision.image.tiling import keep_freed_memory
 from lsvision.io import read_product, read_surface, write_json
 from lsvision.report.progress import progress_bars
 from lsvision.report.surface_pages import surface_report
-from lsvision.report.surface_words import surface_words
+from lsvision.report.surface_words import candidates_in_words, marks_in_words, surface_words, wear_in_words
 from lsvision.schema import Text
 from lsvision.stages.surface.config import SurfaceConfig
 
@@ -40,6 +40,11 @@ def run_inspect(settings: InspectSettings, folder: Path) -> None:
     write_json(folder / "summary.json", summary_of(inspection))
     for line in surface_words(inspection.metadata):
         log.info("%s", line)
+    if settings.surface.reference != "scan":
+        log.info("%s", wear_in_words(inspection.wear, settings.surface.reference))
+    log.info("%s", candidates_in_words(inspection.marked.candidates))
+    for group in inspection.marked.groups:
+        log.info("%s", marks_in_words(group))
     log.info("wrote %s", inspection.path)
     surface_report(product, read_surface(product), inspection, asdict(settings), folder)
 
@@ -52,4 +57,5 @@ def summary_of(inspection: Inspection) -> dict[str, Any]:
         **inspection.metadata,
         "candidates": dict(counts),
         "marks": [asdict(group) for group in inspection.marked.groups],
+        "wear": [asdict(piece) for piece in inspection.wear],
     }

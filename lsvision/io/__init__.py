@@ -2,7 +2,7 @@
 
 from lsvision.io.atomic import naming_full_disk, remove_partial_siblings, write_text
 from lsvision.io.formats.calibration import read_calibration, write_calibration
-from lsvision.io.formats.candidates import write_candidates
+from lsvision.io.formats.candidates import write_candidates, write_wear
 from lsvision.io.formats.checksum import scan_sha256
 from lsvision.io.formats.encoder import read_encoder, write_encoder
 from lsvision.io.formats.line_motion import read_line_motion, write_line_motion
@@ -94,4 +94,5 @@ __all__ = [
     "write_rig_with_response",
     "write_scan",
     "write_text",
+    "write_wear",
 ]

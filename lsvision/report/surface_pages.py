@@ -8,8 +8,8 @@ from lsvision.archive.inspection import Inspection
 from lsvision.io import Product, Surface
 from lsvision.report.pages import Headline, Page, Table, write_report
 from lsvision.report.surface_figures import gallery, profile_and_scatter, unrolled_map
-from lsvision.report.surface_words import candidates_in_words, marks_in_words, surface_words
-from lsvision.types import Candidate, MarkGroup
+from lsvision.report.surface_words import candidates_in_words, marks_in_words, surface_words, wear_in_words
+from lsvision.types import Candidate, MarkGroup, SectionWear
 
 _SHOWN, _LISTED = 24, 100  # candidates in the gallery and in the table
 
@@ -20,9 +20,11 @@ def surface_report(product: Product, surface: Surface, inspection: Inspection, s
     metadata, sigma = inspection.metadata, inspection.metadata["sound_sigma_mm"]
     metres = metadata["length_mm"] / 1e3
     shown = candidates[:_SHOWN]
+    name = metadata["options"]["reference"]
+    worn = [] if name == "scan" else [wear_in_words(inspection.wear, name)]
     page = Page(
         title=f"Surface of {product.path.stem}",
-        lead=". ".join([*surface_words(metadata), *(marks_in_words(group) for group in groups)]),
+        lead=". ".join([*surface_words(metadata), *(marks_in_words(group) for group in groups), *worn]),
         headlines=[
             Headline("Candidates", str(len(candidates)), candidates_in_words(candidates)),
             Headline("A metre", f"{len(candidates) / metres:.1f}", f"of {metres:.2f} m"),
@@ -32,6 +34,7 @@ def surface_report(product: Product, surface: Surface, inspection: Inspection, s
         tables=[
             *([_groups_table(groups)] if groups else []),
             *([_candidates_table(candidates)] if candidates else []),
+            *([_wear_table(inspection.wear)] if inspection.wear else []),
         ],
         figures=[
             unrolled_map(surface, candidates, sigma["smoothed"]),
@@ -86,3 +89,34 @@ def _groups_table(groups: Sequence[MarkGroup]) -> Table:
         for group in groups
     ]  # fmt: skip
     return Table("Marks that repeat", header, rows, "A damaged roll leaves a mark at each turn.")
+
+
+def _wear_table(pieces: Sequence[SectionWear]) -> Table:
+    header = (
+        "along [mm]",
+        "on the section",
+        "crown [um]",
+        "left corner [um]",
+        "right corner [um]",
+        "head's width [mm]",
+    )
+    rows = [
+        (
+            f"{piece.first_mm:.0f} .. {piece.last_mm:.0f}",
+            f"{100 * piece.share:.0f} %",
+            _loss(piece.crown_mm, piece.crown_sigma_mm),
+            _loss(piece.left_corner_mm, piece.corner_sigma_mm),
+            _loss(piece.right_corner_mm, piece.corner_sigma_mm),
+            "not seen" if piece.width_mm is None else f"{piece.width_mm:.3f} ± {piece.width_sigma_mm:.2g}",
+        )
+        for piece in pieces
+    ]
+    note = (
+        "Distance from the nominal section along its normal, below zero where metal is gone: mean over the middle of "
+        "the head, and the worst 2 mm of each gauge corner. The section is laid on what is not worn."
+    )
+    return Table("Wear", header, rows, note)
+
+
+def _loss(value_mm: float | None, sigma_mm: float) -> str:
+    return "not seen" if value_mm is None else f"{1e3 * value_mm:+.0f} ± {1e3 * sigma_mm:.2g}"

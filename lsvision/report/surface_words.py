@@ -1,9 +1,10 @@
 """What was found on a surface, in words."""
 
+import statistics
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from lsvision.types import Candidate, MarkGroup
+from lsvision.types import Candidate, MarkGroup, SectionWear
 
 
 def surface_words(metadata: Mapping[str, Any]) -> list[str]:
@@ -39,3 +40,19 @@ def marks_in_words(group: MarkGroup) -> str:
         f"{group.marks} {group.kind}s of {group.turns} turns repeat every {group.period_mm:.2f} ± "
         f"{group.period_sigma_mm:.2g} mm, {group.around_mm:+.1f} mm around from the crown"
     )
+
+
+def wear_in_words(pieces: Sequence[SectionWear], name: str) -> str:
+    """How an object departs from its nominal section, in the middle of its pieces."""
+    there = [piece for piece in pieces if piece.is_section]
+    if not there:
+        share = max((piece.share for piece in pieces), default=0.0)
+        return f"section {name}: at most {100 * share:.0f} % of the profile lie on it, it is another section"
+    parts = []
+    for key, what in (("crown_mm", "crown"), ("left_corner_mm", "left corner"), ("right_corner_mm", "right corner")):
+        values = [value for piece in there if (value := getattr(piece, key)) is not None]
+        parts.append(f"{what} {statistics.median(values):+.3f} mm" if values else f"{what} not seen")
+    widths = [piece.width_mm for piece in there if piece.width_mm is not None]
+    parts.append(f"head {statistics.median(widths):.2f} mm wide 14 mm under the crown" if widths else "width not seen")
+    few = "" if len(there) == len(pieces) else f" ({len(pieces) - len(there)} of {len(pieces)} pieces do not fit it)"
+    return f"section {name}: {', '.join(parts)}; below zero where metal is gone{few}"

@@ -48,7 +48,7 @@ from lsvision.types.scan import (
     missing_ranges,
 )
 from lsvision.types.section import Section, SectionFit
-from lsvision.types.surface import Candidate, CandidateKind, HeadSide, MarkGroup, ProductSource
+from lsvision.types.surface import Candidate, CandidateKind, HeadSide, MarkGroup, ProductSource, SectionWear
 
 __all__ = [
     "LINE_COMPONENTS",
@@ -98,6 +98,7 @@ __all__ = [
     "Scan",
     "Section",
     "SectionFit",
+    "SectionWear",
     "StereoPair",
     "StoredDepth",
     "TensorImage",

@@ -99,3 +99,30 @@ class MarkGroup:
     first_along_mm: float
     around_mm: float
     depth_mm: float
+
+
+@dataclass(frozen=True)
+class SectionWear:
+    """How a piece of an object departs from its nominal section, mm along the normal, below zero where metal is gone.
+
+    Attributes:
+        first_mm, last_mm: q_y of the piece.
+        is_section: whether half of the profile lies on the section; if not, nothing else says much.
+        share: of the profile that lies on it.
+        crown_mm: mean over the middle of the head. left_corner_mm, right_corner_mm: the worst 2 mm of the gauge corner
+            towards smaller and larger q_x.
+        width_mm: of the head 14 mm under the crown. Each is None where the profile does not reach.
+        crown_sigma_mm, corner_sigma_mm, width_sigma_mm: their standard deviations.
+    """
+
+    first_mm: float
+    last_mm: float
+    is_section: bool
+    share: float
+    crown_mm: float | None
+    left_corner_mm: float | None
+    right_corner_mm: float | None
+    width_mm: float | None
+    crown_sigma_mm: float
+    corner_sigma_mm: float
+    width_sigma_mm: float

@@ -1,5 +1,7 @@
 """Candidates on a surface as Parquet, CSV and GeoJSON: a row or a feature for each, in the order of ``Candidate``.
 
+Wear of its pieces is a CSV in the order of ``SectionWear``.
+
 The GeoJSON's coordinates are (q_x, q_y) of the product, mm, not degrees: a polygon about the ellipse of each candidate.
 """
 
@@ -11,9 +13,9 @@ from typing import Any, get_type_hints
 
 from lsvision.io.atomic import partial_file
 from lsvision.io.json_file import write_json
-from lsvision.types import Candidate
+from lsvision.types import Candidate, SectionWear
 
-TABLE, TEXT, SHAPES = "defects.parquet", "defects.csv", "defects.geojson"
+TABLE, TEXT, SHAPES, WEAR = "defects.parquet", "defects.csv", "defects.geojson", "wear.csv"
 _CORNERS = 24  # of a polygon
 
 
@@ -39,6 +41,16 @@ def write_candidates(candidates: Sequence[Candidate], folder: Path) -> None:
         for number, (candidate, row) in enumerate(zip(candidates, rows, strict=True))
     ]
     write_json(folder / SHAPES, {"type": "FeatureCollection", "unit": "mm", "features": features})
+
+
+def write_wear(pieces: Sequence[SectionWear], folder: Path) -> None:
+    """Write how each piece of an object departs from its section."""
+    import polars
+
+    kinds: dict[Any, Any] = {bool: polars.Boolean}
+    schema = {name: kinds.get(kind, polars.Float64) for name, kind in get_type_hints(SectionWear).items()}
+    with partial_file(folder / WEAR) as partial:
+        polars.DataFrame([asdict(piece) for piece in pieces], schema=schema, orient="row").write_csv(partial)
 
 
 def _finite(candidate: Candidate) -> dict[str, object]:
