@@ -1,4 +1,4 @@
-"""The work on one scan: hash, match, find the line motion, correct, finish; each step where its result is missing."""
+"""The work on one scan: hash, match, find the line motion, correct, finish, inspect; each step without a result yet."""
 
 import shutil
 from collections.abc import Sequence
@@ -8,6 +8,7 @@ from pathlib import Path
 from lsvision.archive.depth_store import create_depth_store, remove_partial_chunks
 from lsvision.archive.health import MeasureHealth, ScanHealth
 from lsvision.archive.identity import key_of
+from lsvision.archive.inspection import InspectedProduct, InspectProduct, is_inspected
 from lsvision.archive.ledger import Ledger, ScanRow, Stage, StripRow, measured_cells
 from lsvision.archive.line_motion import FindLineMotion, FoundLineMotion, StoredLineMotion
 from lsvision.archive.planned import PlannedScan, Processing
@@ -76,6 +77,7 @@ class ScanJob:
             or self._watching()
             or self._correcting()
             or self._finishing()
+            or self._inspecting()
         )
         if tasks:
             self.planned.files.check_unchanged()
@@ -97,7 +99,7 @@ class ScanJob:
                     row, lines=result.lines, measured_cells=cells.count, lowest_mm=cells.lowest_mm,
                     highest_mm=cells.highest_mm,
                 )  # fmt: skip
-            elif isinstance(result, FoundLineMotion):
+            elif isinstance(result, FoundLineMotion | InspectedProduct):
                 row = replace(row, lines=result.lines)
             self._place.ledger.put_strip(row)
 
@@ -201,6 +203,16 @@ class ScanJob:
             self._results.product, self._results.product_key, self._measured_cells(), self._place.verify
         )
         return [Task(self.planned.key, finish)]
+
+    def _inspecting(self) -> list[Task]:
+        config = self._place.processing.surface
+        if config is None:
+            return []
+        results = self._results
+        final, key = results.product.final, results.surface_key
+        if not is_inspected(final, key):
+            self._place.ledger.forget_strips(self.planned.key, "surface")
+        return self._missing("surface", key, [InspectProduct(final, config, key)])
 
     def _line_motion(self) -> StoredLineMotion | None:
         """What was found of the motion from line to line; None where none is corrected or the file is not whole."""

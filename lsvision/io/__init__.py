@@ -32,7 +32,14 @@ from lsvision.io.product.layout import ProductLayout
 from lsvision.io.product.measured import MeasuredCells
 from lsvision.io.product.ply import write_ply
 from lsvision.io.product.reader import Product, ProductImage, read_product
-from lsvision.io.product.surface import Surface, SurfaceRows, read_surface, surface_writer
+from lsvision.io.product.surface import (
+    Surface,
+    SurfaceRows,
+    read_surface,
+    surface_metadata,
+    surface_writer,
+    write_no_surface,
+)
 from lsvision.io.product.writer import ProductRows, complete_product, create_product, product_writer
 
 __all__ = [
@@ -77,6 +84,7 @@ __all__ = [
     "rig_to_dict",
     "scan_files",
     "scan_sha256",
+    "surface_metadata",
     "surface_writer",
     "write_calibration",
     "write_candidates",
@@ -85,6 +93,7 @@ __all__ = [
     "write_laz",
     "write_line_image",
     "write_line_motion",
+    "write_no_surface",
     "write_parquet",
     "write_ply",
     "write_raw_rig",

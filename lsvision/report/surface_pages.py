@@ -3,7 +3,9 @@
 import math
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
+from lsvision.archive import InspectedScan
 from lsvision.archive.inspection import Inspection
 from lsvision.io import Product, Surface
 from lsvision.report.pages import Headline, Page, Table, write_report
@@ -11,6 +13,10 @@ from lsvision.report.surface_figures import gallery, profile_and_scatter, unroll
 from lsvision.report.surface_words import candidates_in_words, marks_in_words, surface_words, wear_in_words
 from lsvision.types import Candidate, MarkGroup, SectionWear
 
+if TYPE_CHECKING:
+    import polars
+
+WORST = 50  # candidates of an archive that its report lists
 _SHOWN, _LISTED = 24, 100  # candidates in the gallery and in the table
 
 
@@ -120,3 +126,32 @@ def _wear_table(pieces: Sequence[SectionWear]) -> Table:
 
 def _loss(value_mm: float | None, sigma_mm: float) -> str:
     return "not seen" if value_mm is None else f"{1e3 * value_mm:+.0f} ± {1e3 * sigma_mm:.2g}"
+
+
+def surfaces_tables(surfaces: Sequence[InspectedScan], worst: "polars.DataFrame") -> list[Table]:
+    """Candidates by scan of an archive, most a metre first, and those that stand out most of all."""
+    by_rate = sorted(surfaces, key=lambda surface: -surface.per_metre)
+    rows = [
+        (
+            surface.scan, f"{surface.length_mm / 1e3:.2f}", str(surface.dents), str(surface.bumps), str(surface.colors),
+            f"{surface.per_metre:.1f}", f"{surface.worst:.0f}" if surface.worst else "", surface.problem,
+        )
+        for surface in by_rate
+    ]  # fmt: skip
+    header = (
+        "scan", "length [m]", "dents", "bumps", "by colour", "dents and bumps a metre", "largest over sigma", "problem",
+    )  # fmt: skip
+    first = Table("Surfaces", header, rows)
+    if not len(worst):
+        return [first]
+    listed = [
+        (
+            row["scan"], row["kind"], f"{row['along_mm']:.1f}", f"{row['around_mm']:+.1f}", row["side"],
+            "" if row["depth_mm"] is None else f"{1e3 * row['depth_mm']:+.0f}",
+            f"{row['length_mm']:.1f} x {row['width_mm']:.1f}", f"{row['ratio']:.0f}",
+        )
+        for row in worst.iter_rows(named=True)
+    ]  # fmt: skip
+    header = ("scan", "kind", "along [mm]", "around [mm]", "side", "depth [um]", "size [mm]", "over sigma")
+    note = "All candidates are in defects.parquet of the output, those that stand out most first."
+    return [first, Table("Worst candidates", header, listed, note)]

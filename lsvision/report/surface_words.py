@@ -4,6 +4,7 @@ import statistics
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from lsvision.archive import InspectedScan
 from lsvision.types import Candidate, MarkGroup, SectionWear
 
 
@@ -56,3 +57,16 @@ def wear_in_words(pieces: Sequence[SectionWear], name: str) -> str:
     parts.append(f"head {statistics.median(widths):.2f} mm wide 14 mm under the crown" if widths else "width not seen")
     few = "" if len(there) == len(pieces) else f" ({len(pieces) - len(there)} of {len(pieces)} pieces do not fit it)"
     return f"section {name}: {', '.join(parts)}; below zero where metal is gone{few}"
+
+
+def surfaces_in_words(surfaces: Sequence[InspectedScan]) -> str:
+    """The surfaces of an archive."""
+    inspected = [surface for surface in surfaces if not surface.problem]
+    metres = sum(surface.length_mm for surface in inspected) / 1e3
+    relief = sum(surface.dents + surface.bumps for surface in inspected)
+    colors = sum(surface.colors for surface in inspected)
+    rest = "" if len(inspected) == len(surfaces) else f"; {len(surfaces) - len(inspected)} show no profile"
+    return (
+        f"surfaces of {len(inspected)} scans, {metres:.1f} m: {relief} dents and bumps, {colors} marks of colour alone"
+        f"{rest}"
+    )

@@ -85,3 +85,18 @@ def test_a_product_without_a_profile_is_one_line_and_stays_as_it_was(product, co
     (line,) = capsys.readouterr().err.splitlines()
     assert "no profile" in line
     assert not (product / "surface").exists()
+
+
+def test_wear_against_a_section_is_stated(product, command, tmp_path, capsys):
+    assert command("+experiment=inspect", f"product={product}", "surface.reference=EN60E1") == 0
+    assert "section EN60E1: " in capsys.readouterr().out
+    summary = json.loads((tmp_path / "run" / "summary.json").read_text())
+    assert [round(piece["last_mm"] - piece["first_mm"]) for piece in summary["wear"]] == [120]
+    assert (product / "surface" / "wear.csv").read_text().count("\n") == 2
+    assert "Wear" in (tmp_path / "run" / "report.html").read_text(encoding="utf-8")
+
+
+def test_a_section_that_is_not_there_is_one_line(product, command, capsys):
+    assert command("+experiment=inspect", f"product={product}", "surface.reference=none.csv") == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "none.csv" in line

@@ -72,6 +72,21 @@ def surface_writer(
         yield SurfaceRows(folder, layout)
 
 
+def write_no_surface(product: Product, problem: str, key: str) -> None:
+    """Say in a product why it has no surface, in place of an earlier one."""
+    with partial_folder(product.path / SURFACE_GROUP, marker=ROOT_METADATA) as folder:
+        attributes = {"lsvision": {"format": SURFACE_FORMAT, "problem": problem, "key": key}}
+        zarr.open_group(folder, mode="w", zarr_format=3, attributes=attributes)
+
+
+def surface_metadata(product: Path | str) -> dict[str, Any]:
+    """What the surface of the product at a path says about itself; empty where it has none that can be read."""
+    try:
+        return dict(zarr.open_group(Path(product) / SURFACE_GROUP, mode="r").attrs["lsvision"])
+    except Exception:  # damaged metadata surfaces as any of a dozen types
+        return {}
+
+
 @dataclass(frozen=True)
 class Surface:
     """The surface of a product on disk; images are read by ranges of rows."""
@@ -110,6 +125,8 @@ def read_surface(product: Product) -> Surface:
     path = product.path / SURFACE_GROUP
     if not path.is_dir():
         raise FileFormatError(product.path, "holds no surface: inspect it first")
+    if problem := surface_metadata(product.path).get("problem"):
+        raise FileFormatError(product.path, str(problem))
     try:
         root = zarr.open_group(path, mode="r")
         metadata = dict(root.attrs["lsvision"])

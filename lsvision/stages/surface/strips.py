@@ -84,8 +84,9 @@ class SurfaceStrip:
 
     @property
     def brightness(self) -> Float[Tensor, "rows cells"]:
-        """Mean of the channels, float32."""
-        return self.color.float().mean(-1)
+        """Mean of the channels, float32; NaN where the product is black and has no height, as no line saw it."""
+        mean = self.color.float().mean(-1)
+        return mean.masked_fill((mean == 0) & ~self.departure.isfinite(), torch.nan)
 
 
 def strip_of(
