@@ -1,7 +1,7 @@
 """An image whose samples lie elsewhere in another one: resampled where it is read, by line ranges."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -12,102 +12,31 @@ from jaxtyping import Bool, Float, Int, Shaped
 from numpy.typing import NDArray
 from torch import Tensor
 
-from lsvision.geometry import line_at, travel_at
-from lsvision.image.tiling import PIXEL_PARTS, tiles
-from lsvision.types import LineImage, Travel, missing_ranges
+from lsvision.image.column_shifts import in_range
+from lsvision.image.sheared_rows import ShearedRows
+from lsvision.image.tiling import tiles
+from lsvision.types import LineImage, missing_ranges
 
 _REACH = 2  # samples beside a position that an interpolation reads
 _TILE, _LINES = (128, 1024), 32  # that stay in the processor's cache
-_KNOT_PX = 64  # columns between those for which lines of an uneven travel are looked up
-
-
-@dataclass(frozen=True)
-class ShearedRows:
-    """Rows that run askew through the lines of a scan.
-
-    Column u of row r lies ``late_mm[u]`` of travel after line r + ``first``, which need not be there.
-
-    Attributes:
-        rows: number of rows. late_mm: by column, float64; None where rows are lines.
-    """
-
-    travel: Travel
-    rows: int
-    first: int = 0
-    late_mm: Float[Tensor, " width"] | None = None
-
-    def lines(
-        self, rows: Float[Tensor, " rows"], columns: slice | Int[Tensor, " columns"] = slice(None)
-    ) -> Float[Tensor, "rows columns"]:
-        """(Fractional) lines that columns of some rows lie on, to 1/2048."""
-        at = rows[:, None] + self.first
-        return at if self.late_mm is None else self._later(at, 1.0, columns)
-
-    def rows_of(
-        self, lines: Float[Tensor, " lines"], columns: slice | Int[Tensor, " columns"] = slice(None)
-    ) -> Float[Tensor, "lines columns"]:
-        """(Fractional) rows on which some lines lie in columns, to 1/2048: the inverse of ``lines``."""
-        at = lines[:, None]
-        return (at if self.late_mm is None else self._later(at, -1.0, columns)) - self.first
-
-    def rows_after(self, row: int, lines: range, columns: Int[Tensor, " columns"]) -> Float[Tensor, "lines columns"]:
-        """The rows on which some lines lie in columns, counted from one near them; float32 is exact."""
-        if self.late_mm is None or self._late_lines is not None:
-            at = torch.arange(lines.start - row - self.first, lines.stop - row - self.first, dtype=torch.float32)[
-                :, None
-            ]
-            return at if self._late_lines is None else at - self._late_lines[columns].float()
-        return (self.rows_of(torch.arange(lines.start, lines.stop, dtype=torch.float64), columns) - row).float()
-
-    def reach(self, lines: tuple[int, int]) -> tuple[int, int]:
-        """First row, and one past the last, that lines ``lines[0]..lines[1]-1`` lie on or between."""
-        rows = self.rows_of(torch.tensor([lines[0], lines[1] - 1], dtype=torch.float64))
-        return max(math.floor(float(rows.min())), 0), min(math.floor(float(rows.max())) + 2, self.rows)
-
-    @cached_property
-    def _late_lines(self) -> Float[Tensor, " width"] | None:
-        """``late_mm`` in lines of an even travel, rounded, so that a row plus it is exact; None where it is uneven."""
-        if self.late_mm is None or self.travel.positions_mm is not None:
-            return None
-        return _rounded(line_at(self.travel, self.late_mm))
-
-    def _later(
-        self, line: Float[Tensor, "rows 1"], sign: float, columns: slice | Tensor
-    ) -> Float[Tensor, "rows columns"]:
-        if self._late_lines is not None:
-            return line + sign * self._late_lines[columns]
-        late_mm = line.new_zeros(1) if self.late_mm is None else sign * self.late_mm
-        wanted = torch.arange(len(late_mm))[columns]
-        knots = torch.arange(int(wanted[0]) // _KNOT_PX, int(wanted[-1]) // _KNOT_PX + 2) * _KNOT_PX
-        knots = knots.clamp(max=len(late_mm) - 1)
-        at_knots = line_at(self.travel, travel_at(self.travel, line) + late_mm[knots])
-        base = (torch.searchsorted(knots, wanted, right=True) - 1).clamp(0, len(knots) - 2)
-        share = ((wanted - knots[base]) / (knots[base + 1] - knots[base]).clamp(min=1)).to(at_knots)
-        return _rounded(torch.lerp(at_knots[:, base], at_knots[:, base + 1], share))
-
-
-def _rounded(position: Tensor) -> Tensor:
-    """Positions to a part of a pixel that single precision holds, too."""
-    return (position * PIXEL_PARTS).round_().div_(PIXEL_PARTS)
 
 
 @dataclass(frozen=True)
 class ResampledImage:
     """A ``LineImage`` of which column u of row r shows ``source`` at column ``columns[u]`` of the line of ``rows``.
 
-    Columns, which grow, are those of the source where they are None. Beyond its ends the source is repeated; see
-    ``outside``. Values are interpolated by cubics along a line, and linearly where only rows differ from lines.
+    Columns grow; a slice takes some of the source as they are. Beyond its ends the source is repeated; see ``outside``.
+    Values are interpolated by cubics along a line, and linearly where only rows differ from lines.
     """
 
     source: LineImage
-    columns: Float[Tensor, " width"] | None
+    columns: Float[Tensor, " width"] | slice
     rows: ShearedRows
 
     @property
     def shape(self) -> tuple[int, int, int]:
         """(rows, width, channels)."""
-        width, channels = self.source.shape[1:]
-        return self.rows.rows, width if self.columns is None else len(self.columns), channels
+        return self.rows.rows, len(self._places), self.source.shape[2]
 
     @property
     def dtype(self) -> torch.dtype:
@@ -122,9 +51,12 @@ class ResampledImage:
 
     def read(self, start: int, stop: int) -> Tensor:
         """Rows ``start..stop-1``."""
-        rows = range(start, stop)
+        return self.read_as(range(start, stop), lambda values: values)
+
+    def read_as(self, rows: range, made: Callable[[Tensor], Tensor]) -> Tensor:
+        """Some rows of what is made of the source's values, ``(lines, width, channels)``, for each sample by itself."""
         lines = self.source_lines(rows)
-        return self.resample(self.source.read(lines.start, lines.stop), lines.start, rows)
+        return self.resample(made(self.source.read(lines.start, lines.stop)), lines.start, rows)
 
     def source_lines(self, rows: range) -> range:
         """Lines of the source that some rows are interpolated from."""
@@ -138,17 +70,27 @@ class ResampledImage:
         out = torch.empty(len(rows), self.shape[1], values.shape[2], dtype=values.dtype)
         for channel in range(values.shape[2]):  # OpenCV counts places in 32nds of a pixel where there are several
             plane = values[..., channel]
-            plane = plane.contiguous() if self._taps is None else self._taps.of(plane)
-            if self.rows.late_mm is None:  # rows are lines
-                taken = torch.arange(rows.start, rows.stop) + (self.rows.first - first_line)
-                out[..., channel] = _in_range(plane[taken.clamp_(0, len(plane) - 1)], out.dtype)
-                continue
-            for tile in self._tiles(rows, first_line, along_lines=False):
+            plane = plane[:, self.columns].contiguous() if self._taps is None else self._taps.of(plane)
+            self._write_rows(plane, first_line, rows, out[..., channel])
+        return out
+
+    def _write_rows(self, plane: Tensor, first_line: int, rows: range, out: Tensor) -> None:
+        """Write what some rows show of lines from a first one on, which have the image's columns."""
+        if self.rows.late_mm is None:  # rows are lines
+            taken = torch.arange(rows.start, rows.stop) + (self.rows.first - first_line)
+            out[:] = in_range(plane[taken.clamp_(0, len(plane) - 1)], out.dtype)
+            return
+        shifted = self.rows.shifted(rows, self.source.shape[0])
+        if shifted:
+            assert self.rows.shifts is not None
+            wanted = slice(shifted.start - rows.start, shifted.stop - rows.start)
+            self.rows.shifts.interpolate(plane, shifted.start + self.rows.first - first_line, out[wanted])
+        for others in (range(rows.start, shifted.start), range(shifted.stop, rows.stop)):
+            for tile in self._tiles(others, first_line, along_lines=False):
                 found = cv2.remap(
                     plane.numpy(), tile.column, tile.line, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
                 )
-                out[..., channel][tile.at] = _in_range(torch.from_numpy(found), out.dtype)
-        return out
+                out[others.start - rows.start :][tile.at] = in_range(torch.from_numpy(found), out.dtype)
 
     def spread(self, marked: Bool[Tensor, "lines width"], first_line: int, rows: range) -> Bool[Tensor, "rows width"]:
         """Which samples of some rows are interpolated from a marked one of the lines ``source_lines``."""
@@ -163,22 +105,39 @@ class ResampledImage:
     def outside(self, rows: range) -> Bool[Tensor, "rows width"] | None:
         """Which samples of some rows lie before the source's first line or after its last; None where none does."""
         last = self.source.shape[0] - 1
-        ends = self.rows.lines(torch.tensor([rows.start, rows.stop - 1], dtype=torch.float64))
-        if float(ends.min()) >= 0 and float(ends.max()) <= last:
+        # Rows on which all columns lie inside are none of them.
+        first, stop = math.ceil(float(self.ends[0].max())) + 1, math.floor(float(self.ends[1].min())) - 1
+        number = torch.arange(rows.start, rows.stop, dtype=torch.float64)
+        number = number[(number < first) | (number >= stop)]
+        at = self.rows.lines(number)
+        beyond = (at < 0) | (at > last)
+        if not bool(beyond.any()):
             return None
-        at = self.rows.lines(torch.arange(rows.start, rows.stop, dtype=torch.float64))
-        return ((at < 0) | (at > last)).expand(-1, self.shape[1])
+        out = torch.zeros(len(rows), self.shape[1], dtype=torch.bool)
+        out[number.long() - rows.start] = beyond
+        return out
+
+    @cached_property
+    def ends(self) -> Float[Tensor, "2 width"]:
+        """The (fractional) rows of the source's first and last line, by column."""
+        lines = torch.tensor([0.0, self.source.shape[0] - 1.0], dtype=torch.float64)
+        return self.rows.rows_of(lines).expand(2, self.shape[1])
 
     @cached_property
     def _taps(self) -> "_Taps | None":
-        return None if self.columns is None else _Taps.at(self.columns, self.source.shape[1])
+        return None if isinstance(self.columns, slice) else _Taps.at(self.columns, self.source.shape[1])
+
+    @cached_property
+    def _places(self) -> Tensor:
+        """Columns of the source, float64."""
+        if isinstance(self.columns, slice):
+            return torch.arange(self.source.shape[1], dtype=torch.float64)[self.columns]
+        return self.columns
 
     def _tiles(self, rows: range, first_line: int, *, along_lines: bool) -> "Iterator[_Positions]":
         """Where the samples of some rows lie: in columns of the source, or of what is interpolated along its lines."""
         number = torch.arange(rows.start, rows.stop, dtype=torch.float64)
-        columns = torch.arange(self.shape[1], dtype=torch.float32)
-        if along_lines and self.columns is not None:
-            columns = self.columns.to(torch.float32)
+        columns = self._places.float() if along_lines else torch.arange(self.shape[1], dtype=torch.float32)
         for tile in tiles(len(rows), self.shape[1], _TILE):
             line = (self.rows.lines(number[tile[0]], tile[1]) - first_line).to(torch.float32)
             column, line = torch.broadcast_tensors(columns[tile[1]], line)
@@ -219,13 +178,6 @@ class _Taps:
             for columns, weights in zip(self.columns, self.weights, strict=True):
                 taken.addcmul_(lines.index_select(1, columns), weights)
         return out
-
-
-def _in_range(values: Tensor, dtype: torch.dtype) -> Tensor:
-    """Values in another dtype, rounded and clamped to its range if it is one of whole numbers."""
-    if dtype.is_floating_point:
-        return values.to(dtype)
-    return values if values.dtype == dtype else values.round().clamp_(0, torch.iinfo(dtype).max).to(dtype)
 
 
 @dataclass(frozen=True)

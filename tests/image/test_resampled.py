@@ -6,7 +6,8 @@ import pytest
 import torch
 
 from lsvision.geometry import line_at, travel_at
-from lsvision.image.resampled import ResampledImage, ShearedRows
+from lsvision.image.resampled import ResampledImage
+from lsvision.image.sheared_rows import ShearedRows
 from lsvision.types import TensorImage, Travel
 
 LINES, WIDTH = 90, 300
@@ -49,15 +50,15 @@ def picture() -> torch.Tensor:
     return (0.7 * line + 0.4 * column)[..., None].expand(-1, -1, 2).contiguous()
 
 
-@pytest.mark.parametrize("columns", [torch.linspace(3.3, WIDTH - 8.1, 250, dtype=torch.float64), None])
+@pytest.mark.parametrize("columns", [torch.linspace(3.3, WIDTH - 8.1, 250, dtype=torch.float64), slice(None)])
 @pytest.mark.parametrize("name", TRAVELS)
 def test_samples_lie_where_they_are_said_to(name, columns):
-    late = LATE_MM if columns is None else LATE_MM[: len(columns)]
+    late = LATE_MM if isinstance(columns, slice) else LATE_MM[: len(columns)]
     rows = ShearedRows(TRAVELS[name], LINES + 40, -20, late)
     image = ResampledImage(TensorImage(picture()), columns, rows)
     assert image.shape == (LINES + 40, len(late), 2)
     line = rows.lines(torch.arange(LINES + 40).double())
-    column = torch.arange(WIDTH).double() if columns is None else columns
+    column = torch.arange(WIDTH).double() if isinstance(columns, slice) else columns
     inside = (line > 2) & (line < LINES - 3) & (column > 2) & (column < WIDTH - 3)
     error = image.read(0, LINES + 40)[..., 1] - (0.7 * line + 0.4 * column)
     assert error[inside].abs().max() < 1e-3
@@ -75,6 +76,19 @@ def test_any_range_gives_the_same_bits(name):
     whole = image.read(0, LINES + 40)
     for start, stop in ((0, 7), (31, 32), (60, 130)):
         assert torch.equal(image.read(start, stop), whole[start:stop])
+
+
+def test_even_travel_is_read_by_whole_lines_as_by_single_places():
+    source = TensorImage(torch.randint(0, 256, (LINES, WIDTH, 3), dtype=torch.uint8))
+    columns = torch.linspace(-4.2, WIDTH + 3.7, WIDTH, dtype=torch.float64)
+    logged = Travel(PITCH, torch.arange(LINES).double() * PITCH)
+    one, other = (
+        ResampledImage(source, columns, ShearedRows(travel, LINES + 40, -20, LATE_MM)).read(0, LINES + 40)
+        for travel in (Travel(PITCH), logged)
+    )
+    difference = (one.int() - other.int()).abs()
+    assert difference.max() <= 1
+    assert difference.float().mean() < 0.01
 
 
 def test_marked_samples_spread_to_what_is_interpolated_from_them():
@@ -100,7 +114,7 @@ def test_rows_beside_missing_lines_are_missing():
         missing: tuple[range, ...] = (range(40, 45),)
 
     rows = ShearedRows(Travel(PITCH), LINES + 40, -20, LATE_MM)
-    image = ResampledImage(Holed(source.tensor), None, rows)
+    image = ResampledImage(Holed(source.tensor), slice(None), rows)
     line = rows.lines(torch.arange(LINES + 40).double())
     touched = ((line > 39) & (line < 45)).any(1).nonzero()[:, 0].tolist()
     (missing,) = image.missing

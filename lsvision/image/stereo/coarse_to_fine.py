@@ -25,6 +25,7 @@ from lsvision.image.stereo.agreement import agreeing, fill_from_background
 from lsvision.image.stereo.best_match import BestMatch, stretches
 from lsvision.image.stereo.blocks import enlarged, repeated
 from lsvision.image.stereo.refine import RefineOptions, refine_disparity
+from lsvision.image.stereo.seen_rows import SeenRows
 from lsvision.image.stereo.sgbm import GrayPair, Search, match_sgbm
 from lsvision.image.tiling import by_rows
 
@@ -44,7 +45,7 @@ _HALF_WINDOW, _QUARTER_WINDOW = 9, 7  # of the refinement
 
 
 def match_coarse_to_fine(
-    pair: GrayPair, search: Search, *, fine_check_px: int, noise: float
+    pair: GrayPair, search: Search, *, fine_check_px: int, noise: float, seen: SeenRows | None = None
 ) -> Float[Tensor, "rows columns"]:
     """Disparity u_left - u_right of each 2 x 2 pixels of a pair of strips, the last ones perhaps incomplete.
 
@@ -55,17 +56,19 @@ def match_coarse_to_fine(
             the half. ``left_right_check_px`` and ``uniqueness_percent`` hold for the quarter.
         fine_check_px: largest disagreement of the two views in the half, px of the full size.
         noise: sigma of the noise of grey values, of 255.
+        seen: the rows that both images show, in each column; None for all.
 
     Source: Hirschmüller 2008, as ``match_sgbm``, over a pyramid as in Rothermel et al. 2012, SURE.
     """
     lines, width = pair.left.shape
     rows, columns = -(-lines // BLOCK), -(-width // BLOCK)
     coarse = _search_quarter(_reduced(pair, COARSEST), search, noise)
+    coarse = coarse if seen is None else seen.extended(coarse, COARSEST)
     filled = fill_from_background(coarse)
     if filled is None:
         return torch.full((rows, columns), torch.nan)
-    surfaces, missing = _surfaces_around(filled), repeated(coarse, COARSEST // BLOCK).isnan()
-    disparity = _search_half(_reduced(pair, BLOCK), surfaces, missing, search, fine_check_px / BLOCK, noise)
+    surfaces = _surfaces_around(filled, repeated(coarse, COARSEST // BLOCK).isnan(), seen)
+    disparity = _search_half(_reduced(pair, BLOCK), surfaces, search, fine_check_px / BLOCK, noise)
     return _within_range(disparity[:rows, :columns].mul(BLOCK), search, width)
 
 
@@ -90,41 +93,55 @@ def _search_quarter(quarter: GrayPair, search: Search, noise: float) -> Tensor:
 
 @dataclass(frozen=True)
 class _Surfaces:
-    """Disparity of the nearest and the farthest surface around each pixel; the same where one search reaches both."""
+    """Disparity of the nearest and the farthest surface around each pixel; the same where one search reaches both.
+
+    ``missing`` is where the quarter has no match, ``beyond`` where one of the images shows nothing; None for nowhere.
+    """
 
     near: Tensor
     far: Tensor
+    missing: Tensor
+    beyond: Tensor | None
+
+    def doubtful(self, near: Tensor) -> Tensor:
+        """Where a search is needed, from the refined disparity of the nearest surface, NaN where it is wrong."""
+        doubt = near.isnan() | (self.near > self.far) | self.missing
+        if self.beyond is None:
+            return _grown(doubt)
+        return _grown(doubt & ~self.beyond) & ~self.beyond
 
 
-def _surfaces_around(coarse: Tensor) -> _Surfaces:
-    """Surfaces around each pixel of the half, px of it, from the disparity of the quarter without gaps."""
+def _surfaces_around(coarse: Tensor, missing: Tensor, seen: SeenRows | None) -> _Surfaces:
+    """Surfaces around each pixel of the half, px of it, from the disparity of the quarter without gaps.
+
+    Args:
+        missing: where the quarter has no match. seen: the rows that both images show.
+    """
     middle = cv2.medianBlur(coarse.numpy(), _MEDIAN)
     kernel = cv2.getStructuringElement(cv2.MORPH_RECT, (_NEIGHBOURHOOD, _NEIGHBOURHOOD))
     near, far, middle = (torch.from_numpy(x) for x in (cv2.dilate(middle, kernel), cv2.erode(middle, kernel), middle))
     one = near - far < _TWO_SURFACES_PX
     near, far = (enlarged(2 * torch.where(one, middle, surface), 2, _EDGE_PX) for surface in (near, far))
-    return _Surfaces(near, far)
+    beyond = None if seen is None else seen.beyond(near, BLOCK, _HALF_WINDOW // 2)
+    return _Surfaces(near, far, missing, beyond)
 
 
-def _search_half(
-    half: GrayPair, surfaces: _Surfaces, missing: Tensor, search: Search, check_px: float, noise: float
-) -> Tensor:
+def _search_half(half: GrayPair, surfaces: _Surfaces, search: Search, check_px: float, noise: float) -> Tensor:
     """Refined disparity at half the size, searched for only where the surfaces are in doubt.
 
     The doubt follows from the surroundings of a pixel alone, so that the result does not depend on the strip.
 
     Args:
-        missing: where the quarter has no match. check_px: largest disagreement of the two views.
+        check_px: largest disagreement of the two views.
     """
     options = RefineOptions(_HALF_WINDOW, iterations=1, noise=noise, with_sigma=False)
     doubting = replace(options, largest_misfit_px=_DOUBTFUL_PX / _HALF_WINDOW)
     near = refine_disparity(half.left, half.right, surfaces.near, doubting).disparity
-    wrong, two = near.isnan(), surfaces.near > surfaces.far
-    doubtful = _grown(wrong | two | missing)
-    best = BestMatch.of(half, torch.where(wrong, surfaces.near, near))
+    doubtful = surfaces.doubtful(near)
+    best = BestMatch.of(half, torch.where(near.isnan(), surfaces.near, near))
     around = _search_around(search)
     best.search_around(surfaces.near, doubtful, around)
-    best.search_around(surfaces.far, two, around)
+    best.search_around(surfaces.far, doubtful & (surfaces.near > surfaces.far), around)
     disparity = agreeing(without_speckles(best.disparity, search.speckle_px), best.cost, check_px)
     return _refined_where(half, disparity, doubtful, options)
 

@@ -18,12 +18,13 @@ from torch import Tensor
 from lsvision.image.brightness import gray_bytes
 from lsvision.image.levels import PairLevels
 from lsvision.image.missing import missing_mask
+from lsvision.image.resampled import ResampledImage
 from lsvision.image.stereo.exposure import Exposure, fit_exposure
 from lsvision.image.stereo.refine import RefineOptions, refine_disparity
 from lsvision.image.stereo.rows import RowOffset, Tiles, joined, row_offset
 from lsvision.image.stereo.sgbm import GrayPair, Search, match_sgbm
 from lsvision.image.stereo.warp import warp_cubic
-from lsvision.types import StereoPair
+from lsvision.types import LineImage, StereoPair
 
 _LINES_PER_BAND, _MOST_BANDS = 1024, 8
 _BAND_PX, _FEWEST_LINES, _MOST_LINES = 2**19, 64, 256  # of a band
@@ -146,13 +147,20 @@ def _bands(images: StereoPair, white: float, size: int) -> list[_Band]:
         starts = _nearest_whole(starts, present, height, margin)
     return [
         _Band(
-            gray_bytes(left.read(start, start + height), white),
-            gray_bytes(right.read(start - margin, start + height + margin), white),
+            _gray(left, range(start, start + height), white),
+            _gray(right, range(start - margin, start + height + margin), white),
             margin,
             size,
         )
         for start in starts
     ]
+
+
+def _gray(image: LineImage, lines: range, white: float) -> UInt8[Tensor, "lines width"]:
+    """Brightness of some lines as bytes; an image that is resampled is so in one channel."""
+    if not isinstance(image, ResampledImage):
+        return gray_bytes(image.read(lines.start, lines.stop), white)
+    return image.read_as(lines, lambda values: gray_bytes(values, white)[..., None])[..., 0]
 
 
 def _present(images: StereoPair) -> Bool[Tensor, " lines"]:

@@ -16,6 +16,7 @@ from lsvision.image.stereo.gloss import RESIDUAL_NOISE, light_is_suspect, proven
 from lsvision.image.stereo.refine import RefineOptions, refine_disparity
 from lsvision.image.stereo.relation import PairRelation, measure_relation
 from lsvision.image.stereo.residuals import Misfit, usual_variance
+from lsvision.image.stereo.seen_rows import SeenRows
 from lsvision.image.stereo.sgbm import GrayPair, Search, match_sgbm
 from lsvision.image.stereo.steps import step_evidence
 from lsvision.image.tiling import HaloRange, by_rows
@@ -103,7 +104,8 @@ def measure_lines(
         mean = _mean_of(gray_left[~missing])
         gray_left, gray_right = (image.masked_fill(missing[:, None], mean) for image in (gray_left, gray_right))
         unusable = unusable.on_lines(~missing)
-    match = _measure(gray_left, gray_right, unusable, rig, config, with_gain=with_gain)
+    seen = SeenRows.of(pair.left, pair.right, outer, shift)
+    match = _measure(GrayStrip(gray_left, gray_right, unusable, seen), rig, config, with_gain=with_gain)
     partner = torch.arange(lines.start, lines.stop) + shift
     spoiled = missing_near(missing, config.refine_window)[lines.inner]
     disparity, sigma = (values[lines.inner] for values in (match.disparity, match.sigma))
@@ -123,18 +125,27 @@ def _mean_of(values: Tensor) -> int:
     return round(float(values.float().mean())) if values.numel() else 0
 
 
-def _measure(
-    left: Tensor, right: Tensor, unusable: UnusableSamples, rig: Rig, config: DisparityConfig, *, with_gain: bool
-) -> StripMatch:
+@dataclass(frozen=True)
+class GrayStrip:
+    """Grey values of a pair of strips, the samples that must not be matched, and what both show; None for all rows."""
+
+    left: Tensor
+    right: Tensor
+    unusable: UnusableSamples
+    seen: SeenRows | None
+
+
+def _measure(strip: GrayStrip, rig: Rig, config: DisparityConfig, *, with_gain: bool) -> StripMatch:
     """Disparity and sigma of a pair of grey images: search, then refinement.
 
     Args:
         with_gain: the refinement takes a factor between their brightnesses for an unknown.
     """
+    left, right, unusable = strip.left, strip.right, strip.unusable
     # In noise alone every pixel would find a match somewhere.
     if any(float(image[::_BLANK_TEST_STEP].float().std()) <= config.refine_noise for image in (left, right)):
         return StripMatch(torch.full(left.shape, torch.nan), torch.full(left.shape, torch.nan))
-    searched = _search(left, right, rig, config)
+    searched = _search(strip, rig, config)
     block, (lines, width) = block_side(left, searched), left.shape
     disparity = unusable.removed_from(searched, block)
     if not config.refine_iterations:
@@ -162,7 +173,8 @@ def _measure(
     if disparity is not searched:
         factor = factor * holes_factor(searched, disparity, options.window_blocks(block))
     lowest_px = float(disparity_range(rig, config)[0])
-    steps = step_evidence(left, right, own, misfit.noise_variance, lowest_px)
+    surface = own if strip.seen is None else strip.seen.extended(own, block)
+    steps = step_evidence(left, right, surface, misfit.noise_variance, lowest_px)
     own = by_rows(lambda values, refuted: values.masked_fill(refuted, torch.nan), own, steps.refuted)
     variance = steps.variance if light_variance is None else steps.variance.add_(light_variance)
     sigma = by_rows(_sigma, variance, factor, refined.sigma, own)
@@ -174,13 +186,14 @@ def _sigma(variance: Tensor, factor: Tensor, refined: Tensor, disparity: Tensor)
     return torch.addcmul(variance, factor, refined * refined).sqrt_().add_(disparity - disparity)
 
 
-def _search(left: Tensor, right: Tensor, rig: Rig, config: DisparityConfig) -> Tensor:
+def _search(strip: GrayStrip, rig: Rig, config: DisparityConfig) -> Tensor:
     """Disparity of a pair of grey images by the configured matcher, for each pixel or for each 2 x 2 pixels."""
     search = _search_range(rig, config)
-    pair = GrayPair.of(left[..., None], right[..., None], white=255.0)
+    pair = GrayPair.of(strip.left[..., None], strip.right[..., None], white=255.0)
     if config.matcher == "sgbm":
         return match_sgbm(pair, search)
-    return match_coarse_to_fine(pair, search, fine_check_px=config.fine_check_px, noise=config.refine_noise)
+    check_px, noise = config.fine_check_px, config.refine_noise
+    return match_coarse_to_fine(pair, search, fine_check_px=check_px, noise=noise, seen=strip.seen)
 
 
 def _search_range(rig: Rig, config: DisparityConfig) -> Search:

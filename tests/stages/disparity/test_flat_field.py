@@ -8,7 +8,8 @@ import torch
 from lsvision.geometry import scaled_rig
 from lsvision.image.flat_field import FlatFieldImage
 from lsvision.image.levels import CameraLevels, PairLevels
-from lsvision.image.resampled import ResampledImage, ShearedRows
+from lsvision.image.resampled import ResampledImage
+from lsvision.image.sheared_rows import ShearedRows
 from lsvision.simulation import Acquisition, SceneConfig, SensorConfig, simulate
 from lsvision.stages.disparity.depth import depth_of
 from lsvision.stages.disparity.gray_lines import GrayLines
@@ -37,7 +38,7 @@ def test_saturated_samples_and_blind_columns_are_no_measurements(uneven):
     expected[5, 11] = True
     assert torch.equal(lines.unusable, expected)
     assert float(lines.gray.max()) > 255  # brighter than any code: not clamped
-    resampled = ResampledImage(uneven, None, ShearedRows(Travel(1.0), 20, 0, None))
+    resampled = ResampledImage(uneven, slice(None), ShearedRows(Travel(1.0), 20, 0, None))
     again = GrayLines.read(resampled, range(20), levels, 255.0)
     assert torch.equal(again.gray[:, 5:10], lines.gray[:, 5:10])
     assert bool(again.unusable[:, 3].all())
