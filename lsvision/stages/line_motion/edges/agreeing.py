@@ -22,7 +22,7 @@ _LEAST_ALIKE, _MOST_APART_CELLS = 0.5, 1.0  # contrast and shift of an edge's pi
 _TRACK_CELLS = 0.75  # median distance of two tracks that agree
 
 
-_TOO_FEW = "fewer than two straight edges along the travel show it"
+TOO_FEW = "fewer than two straight edges along the travel show it"
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ def agreed(common: CommonMotion, config: LineMotionConfig) -> Agreed | str:
             return "its edges along the travel contradict each other"
         else:
             return Agreed(fit, len(edges))
-    return f"two edges along the travel contradict each other by {departs:.2g} mm" if departs else _TOO_FEW
+    return f"two edges along the travel contradict each other by {departs:.2g} mm" if departs else TOO_FEW
 
 
 def _on_object(common: CommonMotion) -> Bool[Tensor, " tracks"]:
