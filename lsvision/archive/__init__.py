@@ -16,6 +16,7 @@ from lsvision.archive.product import product_path
 from lsvision.archive.sources.calibrations import DatedCalibration, calibration_for, read_calibrations
 from lsvision.archive.sources.catalogue import Found, find_scans
 from lsvision.archive.sources.remote import local_archive
+from lsvision.archive.surfaces import InspectedScan, gather_surfaces, worst_candidates
 from lsvision.archive.tasks import Outcome, Task, product_rows
 
 __all__ = [
@@ -29,6 +30,7 @@ __all__ = [
     "FinishedProduct",
     "Found",
     "InProcessEngine",
+    "InspectedScan",
     "Ledger",
     "LineMotionChoice",
     "LocalEngine",
@@ -45,6 +47,7 @@ __all__ = [
     "calibration_for",
     "damaged_products",
     "find_scans",
+    "gather_surfaces",
     "groups_of",
     "health_in_words",
     "is_worked_on",
@@ -63,4 +66,5 @@ __all__ = [
     "read_calibrations",
     "sole_run",
     "worker_count",
+    "worst_candidates",
 ]

@@ -1,4 +1,4 @@
-"""The work on one scan: hash, match, find the line motion, correct, finish; each step where its result is missing."""
+"""The work on one scan: hash, match, find the line motion, correct, finish, inspect; each step without a result yet."""
 
 import shutil
 from collections.abc import Sequence
@@ -8,12 +8,13 @@ from pathlib import Path
 from lsvision.archive.depth_store import create_depth_store, remove_partial_chunks
 from lsvision.archive.health import MeasureHealth, ScanHealth
 from lsvision.archive.identity import key_of
-from lsvision.archive.ledger import Ledger, ScanRow, Stage, StripRow, measured_cells
-from lsvision.archive.line_motion import FindLineMotion, FoundLineMotion, StoredLineMotion
+from lsvision.archive.inspection import InspectProduct, is_inspected
+from lsvision.archive.ledger import Ledger, ScanRow, Stage, measured_cells
+from lsvision.archive.line_motion import FindLineMotion, StoredLineMotion
 from lsvision.archive.planned import PlannedScan, Processing
 from lsvision.archive.product import check_own, is_finished, product_layout
 from lsvision.archive.results import ScanResults
-from lsvision.archive.rows import finished_row, running_row
+from lsvision.archive.rows import finished_row, running_row, strip_row
 from lsvision.archive.tasks import Outcome, Strip, Task
 from lsvision.archive.work import (
     CorrectionInput,
@@ -22,7 +23,6 @@ from lsvision.archive.work import (
     HashInput,
     InputHash,
     MatchStrip,
-    StripResult,
     Work,
 )
 from lsvision.errors import FileFormatError, NothingMeasuredError
@@ -76,6 +76,7 @@ class ScanJob:
             or self._watching()
             or self._correcting()
             or self._finishing()
+            or self._inspecting()
         )
         if tasks:
             self.planned.files.check_unchanged()
@@ -86,19 +87,7 @@ class ScanJob:
         result = outcome.result
         if isinstance(result, InputHash | ScanHealth):
             self._place.ledger.put_scan(replace(self._row, **asdict(result)))
-        if task.strip is not None:
-            row = StripRow(
-                task.scan, task.strip.stage, task.strip.number, task.strip.key,
-                "failed" if outcome.error else "done", outcome.error or "", seconds=outcome.seconds,
-            )  # fmt: skip
-            if isinstance(result, StripResult):
-                cells = result.measured
-                row = replace(
-                    row, lines=result.lines, measured_cells=cells.count, lowest_mm=cells.lowest_mm,
-                    highest_mm=cells.highest_mm,
-                )  # fmt: skip
-            elif isinstance(result, FoundLineMotion):
-                row = replace(row, lines=result.lines)
+        if (row := strip_row(task, outcome)) is not None:
             self._place.ledger.put_strip(row)
 
     def finish(self) -> ScanRow:
@@ -201,6 +190,16 @@ class ScanJob:
             self._results.product, self._results.product_key, self._measured_cells(), self._place.verify
         )
         return [Task(self.planned.key, finish)]
+
+    def _inspecting(self) -> list[Task]:
+        config = self._place.processing.surface
+        if config is None:
+            return []
+        results = self._results
+        final, key = results.product.final, results.surface_key
+        if not is_inspected(final, key):
+            self._place.ledger.forget_strips(self.planned.key, "surface")
+        return self._missing("surface", key, [InspectProduct(final, config, key)])
 
     def _line_motion(self) -> StoredLineMotion | None:
         """What was found of the motion from line to line; None where none is corrected or the file is not whole."""

@@ -20,7 +20,7 @@ _OF_THE_DISK = {
     sqlite3.SQLITE_LOCKED, sqlite3.SQLITE_NOMEM,
 }  # fmt: skip
 
-Stage = Literal["disparity", "line_motion", "health", "product"]
+Stage = Literal["disparity", "line_motion", "health", "product", "surface"]
 Status = Literal["running", "stopped", "done", "failed"]  # a scan as running while no run is at work was stopped
 
 log = logging.getLogger(__name__)

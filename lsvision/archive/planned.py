@@ -16,6 +16,7 @@ from lsvision.stages.correction.config import CorrectionConfig
 from lsvision.stages.correction.grid import most_lines, plan_product, source_dtype
 from lsvision.stages.disparity.config import DisparityConfig
 from lsvision.stages.disparity.match import disparity_range
+from lsvision.stages.surface.config import SurfaceConfig
 from lsvision.types import MissingLines, ProductGrid, Scan, StereoPair
 
 # Peak of a worker over an idle one, as measured; an idle one holds torch, OpenCV and the decoded ends of its files.
@@ -28,7 +29,10 @@ _MIN_ROWS = 32
 
 @dataclass(frozen=True)
 class Processing:
-    """What is done to every scan, and the memory that a worker may take for it; None for all that the machine has."""
+    """What is done to every scan, and the memory that a worker may take for it; None for all that the machine has.
+
+    ``surface`` is how the surfaces of products are inspected; None where they are not.
+    """
 
     disparity: DisparityConfig
     correction: CorrectionConfig
@@ -36,6 +40,7 @@ class Processing:
     worker_memory_mb: int | None
     missing_lines: MissingLines = "refuse"
     line_motion: LineMotionChoice = field(default_factory=LineMotionChoice)
+    surface: SurfaceConfig | None = None
 
     @property
     def with_sigma(self) -> bool:
@@ -47,7 +52,8 @@ class Processing:
         """Hash of the options that products depend on; the height of strips of rows is not part of it."""
         options = options_without_strips(self.correction)
         kept = self.repair_encoder, self.missing_lines, self.line_motion.key
-        return key_of(asdict(self.disparity), options, *kept)
+        inspected = () if self.surface is None else (asdict(self.surface),)
+        return key_of(asdict(self.disparity), options, *kept, *inspected)
 
 
 @dataclass(frozen=True)

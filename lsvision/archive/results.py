@@ -10,6 +10,7 @@ from pathlib import Path
 
 from lsvision import __version__
 from lsvision.archive.identity import depth_key, key_of, product_key
+from lsvision.archive.inspection import inspection_key
 from lsvision.archive.line_motion import Origin
 from lsvision.archive.planned import PlannedScan, Processing
 from lsvision.archive.product import product_path
@@ -61,6 +62,13 @@ class ScanResults:
         sha256, correction = self.planned.calibration.sha256, processing.correction
         key = product_key(self.depth_key, sha256, correction, processing.repair_encoder)
         return key_of(key, self.planned.correction.strip_rows, asdict(self.planned.grid), self.line_motion_key)
+
+    @cached_property
+    def surface_key(self) -> str:
+        """That of the inspection of its surface."""
+        config = self.processing.surface
+        assert config is not None
+        return key_of("surface", self.product_key, inspection_key(config))
 
     @property
     def line_motion_origin(self) -> Origin:

@@ -1,4 +1,4 @@
-"""The ledger's row of a scan, from its start to its end."""
+"""The ledger's rows: of a scan, from its start to its end, and of a strip."""
 
 from collections.abc import Iterable
 from dataclasses import fields, replace
@@ -6,9 +6,12 @@ from typing import Any
 
 from lsvision import __version__
 from lsvision.archive.health import ScanHealth
+from lsvision.archive.inspection import InspectedProduct
 from lsvision.archive.ledger import ScanRow, StripRow
-from lsvision.archive.line_motion import StoredLineMotion
+from lsvision.archive.line_motion import FoundLineMotion, StoredLineMotion
 from lsvision.archive.planned import PlannedScan, Processing
+from lsvision.archive.tasks import Outcome, Task
+from lsvision.archive.work import StripResult
 from lsvision.stages.correction.uncertainty import drift_per_metre
 
 
@@ -68,3 +71,22 @@ def finished_row(
         rms_roll_rad=rms.get("roll", 0.0),
         rms_dy_mm=rms.get("dy", 0.0),
     )
+
+
+def strip_row(task: Task, outcome: Outcome) -> StripRow | None:
+    """The row of the strip that a task made, or failed to make; None where it makes none."""
+    strip, result = task.strip, outcome.result
+    if strip is None:
+        return None
+    row = StripRow(
+        task.scan, strip.stage, strip.number, strip.key,
+        "failed" if outcome.error else "done", outcome.error or "", seconds=outcome.seconds,
+    )  # fmt: skip
+    if isinstance(result, StripResult):
+        cells = result.measured
+        return replace(
+            row, lines=result.lines, measured_cells=cells.count, lowest_mm=cells.lowest_mm, highest_mm=cells.highest_mm
+        )
+    if isinstance(result, FoundLineMotion | InspectedProduct):
+        return replace(row, lines=result.lines)
+    return row

@@ -43,6 +43,8 @@ EXPERIMENTS = {
     "response": Experiment("response", "run_response", "ResponseSettings"),
     "correct": Experiment("correct", "run_correct", "CorrectSettings"),
     "motion": Experiment("motion", "run_motion", "MotionSettings"),
+    "inspect": Experiment("inspect", "run_inspect", "InspectSettings"),
+    "view": Experiment("view", "run_view", "ViewSettings"),
     "reprocess": Experiment("reprocess", "run_reprocess", "ReprocessSettings"),
     "status": Experiment("reprocess", "run_status", "StatusSettings"),
     "validate": Experiment("validate", "run_validate", "ValidateSettings"),

@@ -24,6 +24,7 @@ from lsvision.archive import (
     alarms,
     damaged_products,
     find_scans,
+    gather_surfaces,
     health_in_words,
     is_worked_on,
     ledger_lines,
@@ -41,11 +42,13 @@ from lsvision.errors import ConfigError, ScansFailedError
 from lsvision.experiments.settings import RunSettings
 from lsvision.report.archive_pages import Run, reprocess_report
 from lsvision.report.progress import progress_bars
+from lsvision.report.surface_words import surfaces_in_words
 from lsvision.schema import PositiveInt, Text
 from lsvision.stages.correction.config import CorrectionConfig
 from lsvision.stages.disparity.config import DisparityConfig
 from lsvision.stages.health.config import HealthConfig
 from lsvision.stages.line_motion.config import LineMotionConfig
+from lsvision.stages.surface.config import SurfaceConfig
 from lsvision.types import MissingLines, RefusedVerdict
 
 log = logging.getLogger(__name__)
@@ -58,7 +61,8 @@ class ReprocessSettings(RunSettings):
     ``line_motion`` is ``none``, a file for all scans, or ``auto``: a scan's own log, else what its profile shows by
     ``registration``.
     A calibration without a usable n is refused, unless ``accept`` has its verdict. ``health`` is when a drift of the
-    scans is an alarm.
+    scans is an alarm. With ``inspect`` the surface of every product is inspected by ``surface``, and the candidates of
+    all are one table, ``defects.parquet``.
     """
 
     archive: Text
@@ -74,6 +78,8 @@ class ReprocessSettings(RunSettings):
     line_motion: Text = "auto"
     registration: LineMotionConfig = field(default_factory=LineMotionConfig)
     health: HealthConfig = field(default_factory=HealthConfig)
+    inspect: bool = False
+    surface: SurfaceConfig = field(default_factory=SurfaceConfig)
     accept: list[RefusedVerdict] = field(default_factory=list)
 
 
@@ -112,13 +118,18 @@ def run_reprocess(settings: ReprocessSettings, folder: Path) -> None:
         seconds = time.perf_counter() - begin
         keys = {scan.key for scan in (*plan.to_do, *plan.unchanged)} | {found.key for found in plan.faulty}
         rows = {key: row for key, row in ledger.scans().items() if key in keys}
+        made = [key for key, row in rows.items() if row.status == "done"]
+        surfaces = gather_surfaces(output, made) if settings.inspect else []
     failed = {key: row for key, row in rows.items() if row.status == "failed"}
     drifts = alarms(rows, settings.health)
-    reprocess_report(rows, processed, Run(output, seconds, asdict(settings), settings.health, drifts), folder)
+    run = Run(output, seconds, asdict(settings), settings.health, drifts, surfaces)
+    reprocess_report(rows, processed, run, folder)
     for line in ledger_lines(failed):
         log.info("%s", line)
     for drift in drifts:
         log.warning("drift: %s", drift.in_words)
+    if surfaces:
+        log.info("%s", surfaces_in_words(surfaces))
     done = sum(row.status == "done" for row in processed)
     log.info("%d done, %d unchanged, %d failed, in %.1f s", done, len(rows) - done - len(failed), len(failed), seconds)
     if failed:
@@ -171,6 +182,7 @@ def _processing(settings: ReprocessSettings) -> Processing:
         settings.engine.worker_memory_mb,
         settings.missing_lines,
         LineMotionChoice.of(settings.line_motion, settings.registration),
+        surface=settings.surface if settings.inspect else None,
     )
 
 

@@ -2,6 +2,7 @@
 
 from lsvision.io.atomic import naming_full_disk, remove_partial_siblings, write_text
 from lsvision.io.formats.calibration import read_calibration, write_calibration
+from lsvision.io.formats.candidates import write_candidates, write_wear
 from lsvision.io.formats.checksum import scan_sha256
 from lsvision.io.formats.encoder import read_encoder, write_encoder
 from lsvision.io.formats.line_motion import read_line_motion, write_line_motion
@@ -31,6 +32,14 @@ from lsvision.io.product.layout import ProductLayout
 from lsvision.io.product.measured import MeasuredCells
 from lsvision.io.product.ply import write_ply
 from lsvision.io.product.reader import Product, ProductImage, read_product
+from lsvision.io.product.surface import (
+    Surface,
+    SurfaceRows,
+    read_surface,
+    surface_metadata,
+    surface_writer,
+    write_no_surface,
+)
 from lsvision.io.product.writer import ProductRows, complete_product, create_product, product_writer
 
 __all__ = [
@@ -43,6 +52,8 @@ __all__ = [
     "ProductLayout",
     "ProductRows",
     "RigPair",
+    "Surface",
+    "SurfaceRows",
     "check_product",
     "check_rig_match",
     "complete_product",
@@ -65,6 +76,7 @@ __all__ = [
     "read_rig_pair",
     "read_scan",
     "read_section",
+    "read_surface",
     "remove_partial_siblings",
     "rig_difference",
     "rig_file",
@@ -72,12 +84,16 @@ __all__ = [
     "rig_to_dict",
     "scan_files",
     "scan_sha256",
+    "surface_metadata",
+    "surface_writer",
     "write_calibration",
+    "write_candidates",
     "write_encoder",
     "write_json",
     "write_laz",
     "write_line_image",
     "write_line_motion",
+    "write_no_surface",
     "write_parquet",
     "write_ply",
     "write_raw_rig",
@@ -87,4 +103,5 @@ __all__ = [
     "write_rig_with_response",
     "write_scan",
     "write_text",
+    "write_wear",
 ]

@@ -5,11 +5,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from lsvision.archive import Alarm, ScanRow, health_in_words, product_path
+from lsvision.archive import Alarm, InspectedScan, ScanRow, health_in_words, product_path, worst_candidates
 from lsvision.io import read_product
 from lsvision.report import Headline, Page, ReportFigure, Table, write_report
 from lsvision.report.drawing import new_figure, show_image, thinned
 from lsvision.report.health_figures import health_figures, health_tables
+from lsvision.report.surface_pages import WORST, surfaces_tables
 from lsvision.stages.health.config import HealthConfig
 
 _MAX_THUMBNAILS = 24
@@ -19,13 +20,14 @@ _ROWS = 1024
 
 @dataclass(frozen=True)
 class Run:
-    """A run over an archive: where its products lie, how long it took, its options, and the drifts it found."""
+    """A run over an archive: where its products lie, how long it took, its options, drifts and surfaces."""
 
     output: Path
     seconds: float
     settings: dict[str, Any]
     health: HealthConfig
     alarms: Sequence[Alarm] = ()
+    surfaces: Sequence[InspectedScan] = ()
 
 
 def reprocess_report(rows: Mapping[str, ScanRow], processed: Sequence[ScanRow], run: Run, folder: Path) -> None:
@@ -51,6 +53,7 @@ def reprocess_report(rows: Mapping[str, ScanRow], processed: Sequence[ScanRow], 
         ],
         tables=[
             *health_tables(run.alarms),
+            *(surfaces_tables(run.surfaces, worst_candidates(output, WORST)) if run.surfaces else ()),
             Table("Failed scans", ("scan", "reason"), [(row.scan, row.error) for row in failed]),
             Table(
                 "Scans",

@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 
 from annotated_types import Ge, Le, Lt
 
-from lsvision.schema import AcuteAngle, Checked, NonNegative, Positive, PositiveInt, Seed, Share, Wavelengths
+from lsvision.schema import AcuteAngle, Checked, Interval, NonNegative, Positive, PositiveInt, Seed, Share, Wavelengths
 
 Lights = Literal["beside", "along"]
 
@@ -47,6 +47,8 @@ class SceneConfig(Checked):
     corrugation_mm: NonNegative = 0.0  # amplitude; 0: the same height all along
     corrugation_wavelength_mm: Positive = 80.0
     defect_spacing_mm: NonNegative = 120.0  # one scratch and one pit per length of rail; 0: none
+    pit_radius_mm: Interval = (2.0, 4.5)  # from which that of each pit is drawn, and its depth from the next
+    pit_depth_mm: Interval = (0.4, 1.0)
     roll_mark_period_mm: NonNegative = 150.0  # circumference of the damaged roll; 0: none
     conveyor_drop_mm: float = 26.0  # of the conveyor under the plane of zero disparity
     dirt_share: Share = 0.02  # of a white reference

@@ -14,8 +14,7 @@ from lsvision.simulation.noise import Nodes, lattice_hash
 _PIT, _SCRATCH, _MARK = range(3)
 # Defects lie on the crown, up to the start of the 13 mm radius.
 _CROWN_MM = 20.0
-_SCRATCH_LENGTH_MM, _SCRATCH_WIDTH_MM, _SCRATCH_DEPTH_MM, _SCRATCH_SKEW = 45.0, 1.0, 0.25, 0.12
-_PIT_RADIUS_MM, _PIT_DEPTH_MM = (2.0, 4.5), (0.4, 1.0)
+SCRATCH_LENGTH_MM, _SCRATCH_WIDTH_MM, _SCRATCH_DEPTH_MM, _SCRATCH_SKEW = 45.0, 1.0, 0.25, 0.12
 _MARK_RADII_MM, _MARK_DEPTH_MM, _MARK_S_MM = (5.0, 9.0), 0.4, 9.0
 # Relative change of the reflectance in the middle of a defect: scratches show bright metal.
 _PIT_GLOSS, _SCRATCH_GLOSS, _MARK_GLOSS = -0.65, 1.2, -0.55
@@ -49,13 +48,32 @@ class Cells:
         return (lattice_hash(self.index, stream, seed).double() + 1.0) / 2
 
 
+@dataclass(frozen=True)
+class Pits:
+    """Round hollows: middle (s, along), radius and depth, mm, ``(pits, 1, 1)``."""
+
+    s: Tensor
+    along: Tensor
+    radius_mm: Tensor
+    depth_mm: Tensor
+
+
+@dataclass(frozen=True)
+class Scratches:
+    """Long hollows that begin at (s, along), mm, and run aside by ``skew`` mm a mm; ``(scratches, 1, 1)``."""
+
+    s: Tensor
+    along: Tensor
+    skew: Tensor
+
+
 def defects(scene: SceneConfig, nodes: Nodes, seed: int) -> Relief:
     """Depth and reflectance, float32, of all defects of a rail at nodes of (s, l)."""
     s, along = nodes.grid()
     parts = []
     if scene.defect_spacing_mm > 0:
-        cells = _cells_near(along, scene.defect_spacing_mm, _SCRATCH_LENGTH_MM)
-        parts += [_pits(s, along, cells, seed), _scratches(s, along, cells, seed)]
+        cells = _cells_near(along, scene.defect_spacing_mm, SCRATCH_LENGTH_MM)
+        parts += [_pits(s, along, drawn_pits(scene, cells, seed)), _scratches(s, along, drawn_scratches(cells, seed))]
     if scene.roll_mark_period_mm > 0:
         parts.append(_roll_marks(s, along, _cells_near(along, scene.roll_mark_period_mm, _MARK_RADII_MM[1])))
     depth, factor = torch.zeros(nodes.count_y, nodes.count_x), torch.ones(nodes.count_y, nodes.count_x)
@@ -64,20 +82,37 @@ def defects(scene: SceneConfig, nodes: Nodes, seed: int) -> Relief:
     return Relief(depth.float(), factor.float())
 
 
-def _pits(s: Tensor, along: Tensor, cells: Cells, seed: int) -> Relief:
+def drawn_pits(scene: SceneConfig, cells: Cells, seed: int) -> Pits:
+    """The pit of every cell."""
     across, place, size, deep = (cells.draw(4 * _PIT + k, seed) for k in range(4))
-    radius = _PIT_RADIUS_MM[0] + size * (_PIT_RADIUS_MM[1] - _PIT_RADIUS_MM[0])
-    depth = _PIT_DEPTH_MM[0] + deep * (_PIT_DEPTH_MM[1] - _PIT_DEPTH_MM[0])
-    run = along - cells.index.double() * cells.spacing_mm - place * cells.spacing_mm
-    share = _bowl((s - _CROWN_MM * (2 * across - 1)) / radius, run / radius)
-    return Relief((depth * share).sum(0), (1.0 + _PIT_GLOSS * share).prod(0))
+    (least, largest), (shallow, deepest) = scene.pit_radius_mm, scene.pit_depth_mm
+    return Pits(
+        _CROWN_MM * (2 * across - 1),
+        cells.index.double() * cells.spacing_mm + place * cells.spacing_mm,
+        least + size * (largest - least),
+        shallow + deep * (deepest - shallow),
+    )
 
 
-def _scratches(s: Tensor, along: Tensor, cells: Cells, seed: int) -> Relief:
+def drawn_scratches(cells: Cells, seed: int) -> Scratches:
+    """The scratch of every cell."""
     across, place, skew = (cells.draw(4 * _SCRATCH + k, seed) for k in range(3))
-    run = along - cells.index.double() * cells.spacing_mm - place * cells.spacing_mm
-    aside = s - _CROWN_MM * (2 * across - 1) - _SCRATCH_SKEW * (2 * skew - 1) * run
-    share = _bowl(aside / _SCRATCH_WIDTH_MM, (run / _SCRATCH_LENGTH_MM - 0.5) * 2.0)
+    return Scratches(
+        _CROWN_MM * (2 * across - 1),
+        cells.index.double() * cells.spacing_mm + place * cells.spacing_mm,
+        _SCRATCH_SKEW * (2 * skew - 1),
+    )
+
+
+def _pits(s: Tensor, along: Tensor, pits: Pits) -> Relief:
+    share = _bowl((s - pits.s) / pits.radius_mm, (along - pits.along) / pits.radius_mm)
+    return Relief((pits.depth_mm * share).sum(0), (1.0 + _PIT_GLOSS * share).prod(0))
+
+
+def _scratches(s: Tensor, along: Tensor, scratches: Scratches) -> Relief:
+    run = along - scratches.along
+    aside = s - scratches.s - scratches.skew * run
+    share = _bowl(aside / _SCRATCH_WIDTH_MM, (run / SCRATCH_LENGTH_MM - 0.5) * 2.0)
     return Relief((_SCRATCH_DEPTH_MM * share).sum(0), (1.0 + _SCRATCH_GLOSS * share).prod(0))
 
 

@@ -48,6 +48,7 @@ from lsvision.types.scan import (
     missing_ranges,
 )
 from lsvision.types.section import Section, SectionFit
+from lsvision.types.surface import Candidate, CandidateKind, HeadSide, MarkGroup, ProductSource, SectionWear
 
 __all__ = [
     "LINE_COMPONENTS",
@@ -60,10 +61,13 @@ __all__ = [
     "CalibrationMethod",
     "CameraResiduals",
     "CameraResponse",
+    "Candidate",
+    "CandidateKind",
     "Depth",
     "DepthSource",
     "DepthView",
     "ErrorAlongScan",
+    "HeadSide",
     "Installation",
     "InstallationVerdict",
     "Iteration",
@@ -72,6 +76,7 @@ __all__ = [
     "LineImage",
     "LineMotion",
     "LinePitch",
+    "MarkGroup",
     "MissingLines",
     "Motion",
     "Observability",
@@ -79,6 +84,7 @@ __all__ = [
     "PointShift",
     "Pose",
     "ProductGrid",
+    "ProductSource",
     "ProductStrip",
     "Provenance",
     "RawCamera",
@@ -92,6 +98,7 @@ __all__ = [
     "Scan",
     "Section",
     "SectionFit",
+    "SectionWear",
     "StereoPair",
     "StoredDepth",
     "TensorImage",

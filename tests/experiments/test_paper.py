@@ -61,6 +61,9 @@ def test_the_paper_at_a_quarter_of_the_pixels(command, tmp_path):
     assert command("+experiment=paper") == 0
     summary = json.loads((tmp_path / "run" / "summary.json").read_text())
     _check(summary, sheet_px=1.0, numbers_rel=0.003, lines_mm=0.03, product_mm=0.05)
+    by_iteration = summary["still"]["two_step"]["rmse_by_iteration_mm"]
+    assert by_iteration[0] == pytest.approx(2.5006, abs=1e-4)
+    assert by_iteration[5] <= 0.020
     assert (tmp_path / "run" / "report.html").stat().st_size > 100_000
     assert not list(tmp_path.rglob("*.partial"))
 

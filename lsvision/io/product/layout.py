@@ -69,13 +69,13 @@ def create_images(folder: Path | str, layout: ProductLayout) -> None:
     """Create a product's groups and arrays, every cell invalid."""
     attributes = {"lsvision": finite_or_null({**layout.metadata, "format": PRODUCT_FORMAT})}
     root = zarr.open_group(folder, mode="w", zarr_format=3, attributes=attributes)
-    _create_image(root, layout, "color", NUMPY_DTYPES[layout.dtype], 0, layout.channels)
-    _create_image(root, layout, "height", np.float32, np.nan)
-    _create_image(root, layout, "valid", np.bool_, False)
+    create_image(root, layout, "color", NUMPY_DTYPES[layout.dtype], 0, layout.channels)
+    create_image(root, layout, "height", np.float32, np.nan)
+    create_image(root, layout, "valid", np.bool_, False)
     source = np.float64 if layout.source_dtype == torch.float64 else np.float32
-    _create_image(root, layout, "source", source, np.nan, 2)
+    create_image(root, layout, "source", source, np.nan, 2)
     if layout.uncertainty:
-        _create_image(root, layout, "sigma", np.float32, np.nan, 3)
+        create_image(root, layout, "sigma", np.float32, np.nan, 3)
     if layout.line_motion is not None:
         create_line_motion(root, layout.line_motion)
 
@@ -91,7 +91,8 @@ def strip_images(strip: ProductStrip) -> dict[str, Tensor]:
     return images if strip.sigma is None else {**images, "sigma": strip.sigma}
 
 
-def _create_image(root: Any, layout: ProductLayout, name: str, dtype: Any, fill: object, channels: int = 0) -> None:
+def create_image(root: Any, layout: ProductLayout, name: str, dtype: Any, fill: object, channels: int = 0) -> None:
+    """Create one image with its pyramid, every cell ``fill``, in an open group."""
     axes = ("c", "y", "x") if channels else ("y", "x")
     leading = (channels,) if channels else ()
     ome = multiscales(name, axes, layout.grid, layout.levels, averaged=name == "color")

@@ -1,6 +1,6 @@
 """Writing a product: laid out once, its rows written in any order and by any number of processes."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -33,11 +33,7 @@ class ProductRows:
     def __init__(self, folder: Path | str) -> None:
         try:
             root = zarr.open_group(folder, mode="r+")
-            # An empty chunk is written too: a missing chunk is then always a lost one.
-            self._levels: dict[str, list[Any]] = {
-                name: [level.with_config({"write_empty_chunks": True}) for _, level in sorted(root[name].arrays())]
-                for name in image_names(root)
-            }
+            self._levels: dict[str, list[Any]] = {name: open_levels(root[name]) for name in image_names(root)}
         except Exception as error:  # damaged metadata surfaces as any of a dozen types
             raise FileFormatError(folder, f"not a product to be written: {error}") from error
 
@@ -51,7 +47,9 @@ class ProductRows:
         self._check_rows(strip)
         self._check_images(strip)
         images = strip_images(strip)
-        in_parallel(lambda name: self._write_levels(name, strip.row, images[name]), images)
+        in_parallel(
+            lambda name: write_levels(self._levels[name], strip.row, images[name], average=name == "color"), images
+        )
 
     def _check_rows(self, strip: ProductStrip) -> None:
         start, stop, grid_rows = strip.row, strip.row + len(strip.height), self._levels["height"][0].shape[0]
@@ -71,15 +69,23 @@ class ProductRows:
             if tuple(block.shape) != shape or block.dtype != dtype:
                 raise ValueError(f"{name}: expected {shape} {dtype}, got {tuple(block.shape)} {block.dtype}")
 
-    def _write_levels(self, name: str, row: int, block: Tensor) -> None:
-        for index, level in enumerate(self._levels[name]):
-            first = row >> index
-            if block.ndim == 3:
-                level[:, first : first + len(block)] = block.movedim(-1, 0).numpy(force=True)
-            else:
-                level[first : first + len(block)] = block.numpy(force=True)
-            if index + 1 < len(self._levels[name]):
-                block = halve(block, average=name == "color")
+
+def open_levels(group: Any) -> list[Any]:
+    """The levels of an image's pyramid, finest first, for writing."""
+    # An empty chunk is written too: a missing chunk is then always a lost one.
+    return [level.with_config({"write_empty_chunks": True}) for _, level in sorted(group.arrays())]
+
+
+def write_levels(levels: Sequence[Any], row: int, block: Tensor, *, average: bool) -> None:
+    """Write rows of an image, from ``row`` on, at every level of its pyramid."""
+    for index, level in enumerate(levels):
+        first = row >> index
+        if block.ndim == 3:
+            level[:, first : first + len(block)] = block.movedim(-1, 0).numpy(force=True)
+        else:
+            level[first : first + len(block)] = block.numpy(force=True)
+        if index + 1 < len(levels):
+            block = halve(block, average=average)
 
 
 def create_product(folder: Path | str, layout: ProductLayout) -> ProductRows:

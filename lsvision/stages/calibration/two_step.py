@@ -32,13 +32,14 @@ def two_step(problem: BoardProblem, start: Float[Tensor, "*batch state"], config
 
     It has converged where one joint step from its result would gain little. Its covariance is that of the joint
     calibration and the square of the distance to that: of all unknowns together, as that of Step-II, with the poses
-    fixed, would claim directions of n that the boards cannot show; and of what the iteration still lacks. Noise that is
-    correlated along the scan counts in the covariance alone: the paper weighs every corner by itself.
+    fixed, would claim directions of n that the boards cannot show; and of what the iteration still lacks. How well each
+    coordinate of a corner is known, and noise that is correlated along the scan, count in the covariance alone: the
+    paper weighs all corners of a board alike, each by itself.
 
     Source: Wang et al. 2024, Algorithm 1; its step 8 is printed with the inequality the wrong way round.
     """
     plain = replace(problem, correlated=None)
-    prior, middles = prior_about(start, config), Middles.of(plain)
+    prior, middles = prior_about(start, config), Middles.of(_weighed_alike(plain))
     state, path, before = start, [start], rmse(problem, start)
     running = before > config.two_step_threshold_mm
     iterations = torch.zeros_like(running, dtype=torch.long)
@@ -103,6 +104,16 @@ class Middles:
         parts = BoardState.split(state)
         position = parts.position + sign * self.travel[..., None] * parts.n[..., None, :]
         return replace(parts, position=position).join()
+
+
+def _weighed_alike(problem: BoardProblem) -> BoardProblem:
+    """The problem with the mean variance of all coordinates of a board's corners in place of each."""
+    seen = problem.valid.to(problem.points)
+    variance = problem.noise_chol.square().sum((-2, -1)) / 3.0
+    mean = (seen * variance).sum(-1) / seen.sum(-1)
+    eye = torch.eye(3, dtype=mean.dtype, device=mean.device)
+    alike = mean.sqrt()[..., None, None, None] * eye
+    return replace(problem, noise_chol=alike.expand_as(problem.noise_chol))
 
 
 def _as_scattered(problem: BoardProblem, state: Tensor) -> BoardProblem:

@@ -94,9 +94,14 @@ class LineErrors:
 
         Args:
             common_mm: what the depths of a line err by all together.
+
+        Raises:
+            ValueError: no line shows the profile.
         """
         count = sums.pairs.diagonal()
         there = count > _COMMON * count.max()
+        if not bool(there.any()):
+            raise ValueError("no line shows the profile")
         per_line = (count[there, None]).clamp(min=1)
         a, weight = sums.sensitivity[there] / per_line, sums.weight[there, None] / per_line
         slope = (sums.slope[there, None] / per_line).clamp(min=_LEAST_SLOPE)

@@ -72,9 +72,13 @@ def placed(
     """(q_x, height), mm, of samples whose lines are displaced by ``values``."""
     axes = line_axes(frame.axes, pad(values, (0, 1)), middle_point(frame.rig))
     q_x, q_z = (
-        samples.z
-        * (samples.slope * axes.across[:, i, None] + axes.ahead[:, i, None] + samples.plane_slope * frame.axes[i, 1])
-        + axes.origin[:, i, None]
+        torch.addcmul(
+            axes.origin[:, i, None],
+            samples.z,
+            torch.addcmul(
+                axes.ahead[:, i, None] + samples.plane_slope * frame.axes[i, 1], samples.slope, axes.across[:, i, None]
+            ),
+        )
         for i in (0, 2)
     )
     return q_x, frame.height_datum_mm - q_z
@@ -156,7 +160,7 @@ def equations_of(samples: LineSamples, values: Tensor, reference: Reference, fra
     x = samples.slope * samples.z - pivot[0] - values[:, 0, None]
     z = samples.z - pivot[2] - values[:, 1, None]
     by_x, by_z = -(cos * g_x + sin * g_z), sin * g_x - cos * g_z
-    by_roll = g_z * (cos * x - sin * z) - g_x * (sin * x + cos * z)
+    by_roll = by_x * z - by_z * x  # with the place before the turn it needs no sine
     along_ray = samples.slope * by_x + by_z  # what -1 mm of depth does
     sigma = (samples.sigma * along_ray.abs()).clamp(min=_LEAST_SIGMA_MM)
     return Equations(height - level, sigma, (by_x, by_z, by_roll))

@@ -32,10 +32,15 @@ _LOOSE = (0.01, 0.01, 10.0)  # roots of the information beforehand on x, height 
 
 @dataclass(frozen=True)
 class FittedSection:
-    """Where a section lies, and the reference that the lines are compared with."""
+    """Where a section lies, and the reference that the lines are compared with.
+
+    ``distance_mm`` is that of the profile's places from the section along its normal, ``across_mm`` where on it.
+    """
 
     fit: SectionFit
     reference: Reference
+    across_mm: Float[Tensor, " places"]
+    distance_mm: Float[Tensor, " places"]
 
 
 def fit_section(profile: Reference, section: Section, config: LineMotionConfig) -> FittedSection | None:
@@ -71,7 +76,7 @@ def fit_section(profile: Reference, section: Section, config: LineMotionConfig) 
         is_reference=share >= _LEAST_SHARE,
     )
     reference = _reference(profile, shown, distance) if fit.is_reference else None
-    return FittedSection(fit, profile if reference is None else reference)
+    return FittedSection(fit, profile if reference is None else reference, distance.across, distance.value)
 
 
 @dataclass(frozen=True)
