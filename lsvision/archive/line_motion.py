@@ -132,7 +132,7 @@ def section_of(config: LineMotionConfig) -> Section | None:
 def measured_line_motion(
     scan: Scan, depth: DepthSource, motion: Motion, config: LineMotionConfig, section: Section | None = None
 ) -> LineMeasurement:
-    """Measure the motion of a scan on its profile, on one thread: the bits are the same wherever it runs.
+    """Measure the motion of a scan on its profile and edges, on one thread: the bits are the same wherever it runs.
 
     What cannot be measured is no error: the findings say why.
     """
@@ -211,7 +211,7 @@ def line_motion_metadata(motion: LineMotion, origin: Origin, travel: Travel) -> 
         "corrected": [finding.component for finding in motion.findings if finding.state == "corrected"],
         "components": [{**asdict(finding), "in_words": finding.in_words} for finding in motion.findings],
         "ambiguous_wavelengths_mm": list(band) if band else None,
-        "note": ambiguity_in_words(band) if band else "",
+        "note": ambiguity_in_words(band, any(finding.edges for finding in motion.findings)) if band else "",
         "section": None if section is None else {**asdict(section), "in_words": section.in_words},
     }
 
@@ -226,11 +226,12 @@ def ambiguous_band(motion: LineMotion, advance_mm: float) -> tuple[float, float]
     return (min(band[0] for band in bands), max(band[1] for band in bands)) if bands else None
 
 
-def ambiguity_in_words(band: tuple[float, float]) -> str:
-    """Which wavelengths may be shape or vibration: a profile alone does not show which."""
+def ambiguity_in_words(band: tuple[float, float], by_edges: bool = False) -> str:
+    """Which wavelengths may be shape or vibration: a profile, or edges, alone do not show which."""
     return (
         f"wavelengths of {band[0]:.3g} to {band[1]:.3g} mm were taken for vibration: corrugation, bow or twist of the "
         "object over such lengths shows the same on its profile"
+        f"{', a bend of all its edges on them' if by_edges else ''}"
     )
 
 

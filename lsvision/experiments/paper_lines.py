@@ -1,7 +1,7 @@
 """What the motion from line to line does to the scans of the paper's experiment that shook.
 
 Boards show it themselves, on their corners and the edges of their squares. A flat sheet's profile shows depth and roll
-of its lines, and neither their sideways motion nor their travel: for those it needs a log.
+of its lines, its straight edges show their sideways motion but for its trend. For that and the travel it needs a log.
 """
 
 from collections.abc import Mapping

@@ -148,6 +148,13 @@ class ProductFrame:
             q_z = q_z - self.line_axes(line).origin[..., 2]
         return q_z / self.ray(column, line)[..., 2]
 
+    def shown_on_lines(
+        self, place: Float[Tensor, "*#batch 2"], motion: Float[Tensor, "*#batch 4"]
+    ) -> Float[Tensor, "*batch 2"]:
+        """(x, z), mm, in the scan frame, where lines of some motion show what lies at (q_x, q_z), mm."""
+        still = torch.linalg.solve(self.axes[::2, ::2], place[..., None])[..., 0]
+        return shaken(still, motion, middle_point(self.rig).to(still))
+
     def offset_range(self, q_x: Float[Tensor, " places"], z: Float[Tensor, " depths"]) -> tuple[float, float]:
         """Least and greatest q_y, mm, less ``along``, of samples at places across the line and at depths, mm."""
         if self.line_motion is not None:

@@ -18,8 +18,10 @@ def line_motion_words(metadata: Mapping[str, Any]) -> Iterator[str]:
         metadata: the entry ``line_motion`` of a product's metadata.
     """
     source = str(metadata.get("source", "none"))
-    yield f"motion from line to line: {_ORIGINS.get(source, source)}"
-    for component in metadata.get("components", ()):
+    components = metadata.get("components", ())
+    edges = " and straight edges" if source == "measured" and any(each.get("edges") for each in components) else ""
+    yield f"motion from line to line: {_ORIGINS.get(source, source)}{edges}"
+    for component in components:
         yield f"  {component['in_words']}"
     if metadata.get("section"):
         yield f"  {metadata['section']['in_words']}"

@@ -22,7 +22,7 @@ from lsvision.simulation.sheet_points import SheetPoints
 # What of the motion was corrected in the sheet's product, by the source of its motion from line to line.
 _SHEET_SOURCES = {
     "none": "n of boards with steadied lines",
-    "auto": "that n, and lines by the sheet's profile",
+    "auto": "that n, and lines by the sheet's profile and edges",
     "log": "that n, and lines by an exact log",
 }
 
@@ -196,18 +196,31 @@ def sheet_table(scenarios: Mapping[str, Scenario]) -> Table:
     rows: list[tuple[str, ...]] = []
     for name, scenario in scenarios.items():
         rows += [
-            (name, "nothing", f"{scenario.sheet_before.rms_mm:.3f}", "", "", ""),
-            (name, "n", f"{scenario.sheet_after.rms_mm:.3f}", "", "", ""),
+            (name, "nothing", f"{scenario.sheet_before.rms_mm:.3f}", "", "", "", ""),
+            (name, "n", f"{scenario.sheet_after.rms_mm:.3f}", "", "", "", ""),
         ]
         sheets = {} if scenario.steadied is None else scenario.steadied.sheets
         rows += [
-            (name, _SHEET_SOURCES[source], f"{sheet.rms_mm:.3f}", *(f"{value:.3f}" for value in sheet.by_axis_mm))
+            (
+                name,
+                _SHEET_SOURCES[source],
+                *(f"{value:.3f}" for value in (sheet.rms_mm, *sheet.by_axis_mm, sheet.unsheared_mm)),
+            )
             for source, sheet in sheets.items()
         ]
     return Table(
         "The sheet against its artwork",
-        ("scenario", "corrected", "error [mm rms]", "across [mm rms]", "along [mm rms]", "in depth [mm rms]"),
+        (
+            "scenario",
+            "corrected",
+            "error [mm rms]",
+            "across [mm rms]",
+            "along [mm rms]",
+            "in depth [mm rms]",
+            "but for a shear [mm rms]",
+        ),
         rows,
-        "The profile of a flat sheet shows by how much each line is displaced in depth and rolled. It is the same "
-        "wherever a line lies sideways or along the travel: these are not observed, and stay. A log shows them.",
+        "The profile of a flat sheet shows by how much each line is displaced in depth and rolled. Its straight edges "
+        "along the travel show by how much sideways, but for the trend, which looks like a sheared sheet. Displacement "
+        "along the travel is not observed, and stays. A log shows all of it.",
     )

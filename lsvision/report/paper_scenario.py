@@ -70,13 +70,15 @@ class BoardCheck:
 class SheetCheck:
     """Rms error of points of the sheet in a product, mm, in all, and along X, Y and Z of the sheet.
 
-    ``not_seen`` names the components of the motion from line to line that were not observed.
+    ``unsheared_mm`` is that in all but for a shear along the travel. ``not_seen`` names the components of the motion
+    from line to line that were not observed.
     """
 
     points: int
     rms_mm: float
     by_axis_mm: tuple[float, ...]
     not_seen: tuple[str, ...]
+    unsheared_mm: float
 
     @classmethod
     def of(cls, points: SheetPoints, line_motion: Mapping[str, Any]) -> "SheetCheck":
@@ -84,7 +86,8 @@ class SheetCheck:
         error = points.measured_mm - points.true_mm
         found = line_motion.get("components", ())
         not_seen = tuple(each["component"] for each in found if each["state"] == "not observed")
-        return cls(len(error), points.rms_mm, tuple(error.square().mean(0).sqrt().tolist()), not_seen)
+        by_axis = tuple(error.square().mean(0).sqrt().tolist())
+        return cls(len(error), points.rms_mm, by_axis, not_seen, points.unsheared_rms_mm)
 
 
 @dataclass(frozen=True)

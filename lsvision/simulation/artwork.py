@@ -55,7 +55,8 @@ def sheet_raster(scene: SceneConfig) -> Raster:
     hue = torch.stack([value_noise(nodes, coarse, scene.seed * 8 + channel) for channel in (1, 2, 3)])
     color = (0.48 + 0.21 * grain + 0.09 * hue).clamp_(0.06, 0.92)
     x, y = (axis.float() for axis in nodes.grid())
-    color = _print(color, _border(scene, x, y), _BLACK)
+    if scene.sheet_frame:
+        color = _print(color, _border(scene, x, y), _BLACK)
     color = _print(color, _crosses(scene, x, y), _BLACK)
     for index, ink in enumerate(_RING_INKS):
         color = _print(color, _rings(scene, x, y)[index :: len(_RING_INKS)].amax(0), ink)

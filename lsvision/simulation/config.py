@@ -41,6 +41,7 @@ class SceneConfig(Checked):
     board_texture: NonNegative = 0.06  # relative contrast on the board
     sheet_width_mm: Positive = 360.0
     sheet_height_mm: Positive = 270.0
+    sheet_frame: bool = True  # printed along its sides, with a ruler
     rail_length_mm: Positive = 400.0
     rail_rise_mm: float = 22.0  # of the crown over the plane of zero disparity
     rail_texture: NonNegative = 0.16

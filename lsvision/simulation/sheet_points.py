@@ -50,6 +50,24 @@ class SheetPoints:
         """Root-mean-square distance between measured and true points."""
         return float((self.measured_mm - self.true_mm).square().sum(-1).mean().sqrt())
 
+    @property
+    def unsheared_rms_mm(self) -> float:
+        """The same but for a shear of X by Y, which a trend of the sideways motion over the sheet looks like."""
+        x, y, _ = (self.true_mm - self.true_mm.mean(0)).T
+        none, one = torch.zeros_like(x), torch.ones_like(x)
+        pose = (
+            (one, none, none),
+            (none, one, none),
+            (none, none, one),
+            (none, none, x),
+            (none, none, y),
+            (-y, x, none),
+        )
+        design = torch.stack([torch.stack(move) for move in (*pose, (y, none, none))], -1).flatten(0, 1)
+        error = (self.measured_mm - self.true_mm).T.reshape(-1, 1)
+        left = error - design @ torch.linalg.lstsq(design, error).solution
+        return float((left.square().sum() / len(x)).sqrt())
+
 
 def points_in_scan(scan: Scan, depth: DepthSource, simulation: Simulation) -> SheetPoints:
     """Points of the sheet measured in a scan under the nominal motion."""

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from lsvision.schema import NonNegative
+from lsvision.schema import NonNegative, NonNegativeInt
 from lsvision.types.section import SectionFit
 
 LineComponent = Literal["dx", "dz", "roll", "dy"]
@@ -28,6 +28,7 @@ class LineFinding:
     units of the logarithm of the likelihood. ``reason`` says why nothing was observed, where that is not the object's
     shape. ``shape_rms`` is what the profile shows besides and belongs to the object's shape along its travel: it stays
     in the height. Waves up to ``separated_up_to_mm`` were separated from such shape by the colours' lines.
+    ``edges`` is how many straight edges along the travel show the component, where the profile does not.
     """
 
     component: LineComponent
@@ -39,14 +40,16 @@ class LineFinding:
     reason: str = "the object's shape does not show it"
     shape_rms: NonNegative = 0.0
     separated_up_to_mm: float | None = None
+    edges: NonNegativeInt = 0
 
     @property
     def in_words(self) -> str:
         """What was found, for a reader."""
         name, (unit, scale) = _NAMES[self.component], _SHOWN[self.component]
         shape = f"; {self.shape_rms * scale:.2g} {unit} rms are the object's shape" if self.shape_rms > 0 else ""
+        edges = f", from {self.edges} straight edges along the travel" if self.edges else ""
         if self.state == "absent":
-            return f"{name}: nothing above the errors of a line, {self.sigma * scale:.2g} {unit}{shape}"
+            return f"{name}: nothing above the errors of a line, {self.sigma * scale:.2g} {unit}{edges}{shape}"
         if self.state == "not observed":
             error = f" better than to {self.sigma * scale:.2g} {unit}" if self.sigma > 0 else ""
             return f"{name}: not observed, {self.reason}{error}"
@@ -54,7 +57,7 @@ class LineFinding:
         known = f"known to {self.sigma * scale:.2g} {unit}" if self.sigma > 0 else "of unknown sigma"
         known_up_to = self.separated_up_to_mm
         separated = "" if known_up_to is None else f", separated from shape up to waves of {known_up_to:.3g} mm"
-        return f"{name}: {self.rms * scale:.2g} {unit} rms, {known}{length}{separated}{shape}"
+        return f"{name}: {self.rms * scale:.2g} {unit} rms, {known}{edges}{length}{separated}{shape}"
 
 
 @dataclass(frozen=True)

@@ -50,5 +50,8 @@ class LineMotionConfig(Checked):
     evidence: NonNegative = 12.0
     least_ratio: NonNegative = 1.0
     shape_longer_than_mm: Positive | None = None
+    straight_edges: bool = True
+    edge_share: Share = 0.5
+    edges_within_mm: Positive = 0.1
     block_lines: PositiveInt = 256
     halo_lines: PositiveInt = 192

@@ -3,6 +3,7 @@
 1. The reference: lines spread over the scan are aligned to each other and give the object's own profile.
 2. Every line is registered to it, in blocks at fixed places of the scan.
 3. Its displacements are smoothed, and those components kept that are there (``estimate``).
+4. Where the profile does not show sideways motion, straight edges of a flat object do (``flat``).
 
 A profile that changes along the object, as a bent, twisted or corrugated rail's, is the same signal as a motion. The
 lines of the colours, or a stated prior, separate them (``shape``).
@@ -18,13 +19,11 @@ from torch import Tensor
 from lsvision.geometry import (
     ProductFrame,
     color_shift,
-    depth_step_mm,
     middle_point,
     object_pitch_mm,
     project,
     shaken,
     slope_at,
-    travel_at,
 )
 from lsvision.stages.disparity.config import DisparityConfig
 from lsvision.stages.disparity.depth import relation_of_scan
@@ -33,18 +32,19 @@ from lsvision.stages.line_motion.color_pair import ColorPair, ObjectPlace, color
 from lsvision.stages.line_motion.color_travel import ColorTravel, measure_color_travel, with_travel
 from lsvision.stages.line_motion.config import LineMotionConfig
 from lsvision.stages.line_motion.crown import CrownedLines
-from lsvision.stages.line_motion.errors import ErrorSums, LineErrors
-from lsvision.stages.line_motion.estimate import estimate, noisy_values, not_measured
-from lsvision.stages.line_motion.profiles import LineSamples, Reference, columns_of, reference_profile
-from lsvision.stages.line_motion.register import Registered, equations_of, placed, register
+from lsvision.stages.line_motion.errors import LineErrors
+from lsvision.stages.line_motion.estimate import not_measured
+from lsvision.stages.line_motion.estimated import Estimated
+from lsvision.stages.line_motion.flat import measure_flat
+from lsvision.stages.line_motion.profiles import Reference, columns_of, reference_profile
+from lsvision.stages.line_motion.register import placed, register
+from lsvision.stages.line_motion.registration import register_scan
 from lsvision.stages.line_motion.section import fit_section
 from lsvision.stages.line_motion.shape import ShapeData, without_shape
 from lsvision.types import Depth, DepthSource, LineMotion, Motion, Scan, Section, SectionFit
 
 _WINDOWS = 8  # of neighbouring lines, that the reference of a long scan comes from
 _APART = 4  # lines of a window; neighbours err alike
-_READ_LINES, _AT_ONCE = 1024, 256  # read and registered at once
-_SUMMED_READS = 8  # whose residuals say how large the errors are
 _ROUNDS = 2  # of making the reference of lines and aligning them to it, before the last reference
 
 
@@ -59,7 +59,7 @@ class LineMeasurement:
 def measure_line_motion(
     scan: Scan, depth: DepthSource, motion: Motion, config: LineMotionConfig, section: Section | None = None
 ) -> LineMeasurement:
-    """Measure how every line of a scan is displaced and rolled, from its profile alone, and how far it advances.
+    """Measure how every line of a scan is displaced and rolled, from its profile and edges, and how far it advances.
 
     Args:
         depth: of the left image. motion: n of the calibration. section: that ``config.reference`` names.
@@ -79,19 +79,20 @@ def measure_line_motion(
         shown = shown.on_section(section, config)
     if shown is None:
         return LineMeasurement(not_measured(depth.lines, "no profile that half of the lines show was measured"))
-    lines, sums = _registered(frame, depth, shown, config)
-    errors = LineErrors.of(sums, depth_step_mm(scan.rig, config.common_error_px))
-    along = travel_at(scan.travel, torch.arange(depth.lines).double())
-    found = estimate(lines, shown.samples, along, errors, config)
-    valid = noisy_values(lines, shown.samples, config).valid
+    registered = register_scan(frame, depth, shown.reference, shown.columns, config)
+    seen = Estimated.of(registered, shown.samples, frame, config)
+    if config.straight_edges:
+        seen = measure_flat(scan, depth, (shown.reference, shown.columns), seen, frame, config)
+    found, lines, valid = seen.motion, seen.registered.lines, seen.valid
     pair = _colors(scan, frame, shown.place(lines.values[:, 1] * valid, found, frame))
     if not found.is_still:
         columns = shown.reference, shown.columns
         differences = None if pair is None else measure_color_differences(pair, depth, lines, columns, config)
-        found = without_shape(found, ShapeData(lines, valid, along, errors, differences), config)
+        found = without_shape(found, ShapeData(lines, valid, seen.along, seen.registered.errors, differences), config)
     travel = None if pair is None else measure_color_travel(pair, shown.columns)
-    found = found if travel is None else with_travel(found, travel, along)
-    return LineMeasurement(replace(found, section=_placed_section(shown, lines.values[valid], errors, frame)), travel)
+    found = found if travel is None else with_travel(found, travel, seen.along)
+    placed_section = _placed_section(shown, lines.values[valid], seen.registered.errors, frame)
+    return LineMeasurement(replace(found, section=placed_section), travel)
 
 
 def measure_travel(scan: Scan, depth: DepthSource, motion: Motion, config: LineMotionConfig) -> ColorTravel | None:
@@ -190,26 +191,6 @@ def _seen_along(
     q_x, height = place
     reference = reference_profile(q_x, height, object_pitch_mm(frame.rig), config.profile_depth_mm)
     return reference, None if reference is None else columns_of(reference, q_x, config.samples)
-
-
-def _registered(
-    frame: ProductFrame, depth: DepthSource, shown: _Shown, config: LineMotionConfig
-) -> tuple[Registered, ErrorSums]:
-    """The lines of a scan, a few at a time, and sums over what is left of them at places all over the scan."""
-    starts = range(0, depth.lines, _READ_LINES)
-    summed = {i * (len(starts) - 1) // (_SUMMED_READS - 1) for i in range(_SUMMED_READS)}
-    lines, sums = Registered.nothing(depth.lines), []
-    for number, start in enumerate(starts):
-        block = depth.read(start, min(start + _READ_LINES, depth.lines))
-        samples = LineSamples.of(block, frame, config.height_range_mm, shown.columns)
-        for part in samples.split(_AT_ONCE):
-            found = register(part, part.z.new_zeros(len(part.z), 3), shown.reference, frame, config)
-            lines.put(start, found)
-            start += len(part.z)
-            if number in summed:
-                equations = equations_of(part, found.values, shown.reference, frame)
-                sums.append(ErrorSums.of(equations, config.cut_sigma))
-    return lines, ErrorSums.total(sums)
 
 
 def _colors(scan: Scan, frame: ProductFrame, place: ObjectPlace) -> ColorPair | None:
