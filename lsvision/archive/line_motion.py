@@ -231,7 +231,7 @@ def ambiguity_in_words(band: tuple[float, float], by_edges: bool = False) -> str
     return (
         f"wavelengths of {band[0]:.3g} to {band[1]:.3g} mm were taken for vibration: corrugation, bow or twist of the "
         "object over such lengths shows the same on its profile"
-        f"{', a bend of all its edges on them' if by_edges else ''}"
+        f"{', and a sideways bend the same on its edges' if by_edges else ''}"
     )
 
 

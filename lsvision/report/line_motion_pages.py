@@ -56,7 +56,7 @@ def findings_table(metadata: Mapping[str, Any], registration: Mapping[str, Any])
     note = (
         "Log evidence is how much better the lines fit with the component than without. One of which it is below "
         f"{registration['evidence']:g}, or which is less than {registration['least_ratio']:g} times the errors of a "
-        "line, counts as absent. One that the object's shape does not show is not observed."
+        "line, counts as absent. One that neither the object's shape nor its edges show is not observed."
     )
     return Table("Components", header, [_row(item) for item in metadata.get("components", ())], note)
 

@@ -15,14 +15,12 @@ from lsvision.stages.line_motion.config import LineMotionConfig
 from lsvision.stages.line_motion.edges.common import CommonMotion, EdgeFit, shape_length_mm
 from lsvision.stages.line_motion.edges.edge_lines import EdgeLines, robust_straight
 
-_BESIDE_MM = (
-    15.0  # of the profile's ends, within which an edge is the object's side: it is slanted, and depth fails there
-)
+# Beyond the profile's ends, where an edge may be the object's side: that may be slanted, and depth fails beside it.
+_BESIDE_MM = 15.0
 _LEAST_ALIKE, _MOST_APART_CELLS = 0.5, 1.0  # contrast and shift of an edge's picture in the right image
 _TRACK_CELLS = 0.75  # median distance of two tracks that agree
 
-
-_TOO_FEW = "fewer than two straight edges along the travel show it"
+TOO_FEW = "fewer than two straight edges along the travel show it"
 
 
 @dataclass(frozen=True)
@@ -53,7 +51,7 @@ def agreed(common: CommonMotion, config: LineMotionConfig) -> Agreed | str:
             return "its edges along the travel contradict each other"
         else:
             return Agreed(fit, len(edges))
-    return f"two edges along the travel contradict each other by {departs:.2g} mm" if departs else _TOO_FEW
+    return f"two edges along the travel contradict each other by {departs:.2g} mm" if departs else TOO_FEW
 
 
 def _on_object(common: CommonMotion) -> Bool[Tensor, " tracks"]:

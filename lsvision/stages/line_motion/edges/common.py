@@ -23,10 +23,8 @@ from lsvision.stages.line_motion.edges.tracks import Tracks
 
 _ROUNDS, _LAST_ROUNDS = 4, 2
 _SMOOTHED_CELLS, _SHAPE_CELLS = 16.0, 64.0  # standard deviations, over the travel, of δx between rounds and of shapes
-_SHOWN_CELLS, _LEAST_CONTRAST = (
-    8.0,
-    0.5,
-)  # over which contrast is averaged; of the mean picture's, with which an edge shows
+# Over the travel, over which contrast is averaged; of that of the mean picture, with which an edge shows.
+_SHOWN_CELLS, _LEAST_CONTRAST = 8.0, 0.5
 _CUT = 3.0  # standard deviations, beyond which an edge counts less on a line
 _LARGEST_CELLS = 2.0  # of a shift: pictures are linear over no more
 _LEAST_INFORMATION = 1e-4  # of contrast squared

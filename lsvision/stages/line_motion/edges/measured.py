@@ -17,7 +17,7 @@ from lsvision.geometry import ProductFrame, Rectification
 from lsvision.stages.disparity.config import DisparityConfig
 from lsvision.stages.disparity.depth import relation_of_scan
 from lsvision.stages.line_motion.config import LineMotionConfig
-from lsvision.stages.line_motion.edges.agreeing import Agreed, agreed
+from lsvision.stages.line_motion.edges.agreeing import TOO_FEW, Agreed, agreed
 from lsvision.stages.line_motion.edges.cells import Cells
 from lsvision.stages.line_motion.edges.common import CommonMotion, EdgeFit
 from lsvision.stages.line_motion.edges.edge_lines import EdgeLines
@@ -28,7 +28,7 @@ from lsvision.stages.line_motion.register import LOOSE_SIGMA
 from lsvision.stages.line_motion.registration import RegisteredScan
 from lsvision.types import LineMotion, Scan
 
-_FEWEST_LINES = 64
+_FEWEST_LINES, _MOST_LINES = 64, 32768  # eight tracks take 11 kB a line
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,9 @@ def measure_edges(
         return "edges are looked for in rectified images alone"
     there = used.nonzero()[:, 0]
     if len(there) < _FEWEST_LINES:
-        return "fewer than two straight edges along the travel show it"
+        return TOO_FEW
+    if len(there) > _MOST_LINES:
+        return f"edges are looked for on no more than {_MOST_LINES} lines"
     motion = found.values + pad(level, (0, 1))
     lines = range(int(there[0]), int(there[-1]) + 1)
     relation = relation_of_scan(scan, DisparityConfig())

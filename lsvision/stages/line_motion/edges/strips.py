@@ -17,6 +17,7 @@ from lsvision.stages.line_motion.edges.cells import Cells
 _REACH_CELLS = 4  # of a strip to either side of its edge
 _BESIDE = 2  # cells beside a strip, for slopes at its ends
 _SPARE_CELLS = 8  # by which a strip can be moved
+_AT_ONCE = 1024  # lines
 
 
 @dataclass(frozen=True)
@@ -63,20 +64,28 @@ class Strips:
         return torch.stack([contrast, -moved / contrast])
 
     def _at(self, place: Float[Tensor, "views edges lines"]) -> Float[Tensor, "views edges lines wide"]:
-        """Strips about places and what is beside them, by cubic convolution (Keys 1981)."""
-        t = torch.arange(-_REACH_CELLS - _BESIDE, _REACH_CELLS + _BESIDE + 1).to(place)
-        at = ((place - self.first)[..., None] + t).clamp(1, self.values.shape[-1] - 2)
-        base = at.floor().clamp(max=self.values.shape[-1] - 3).long()
-        f = at - base
-        weights = (
-            ((-0.5 * f + 1.0) * f - 0.5) * f,
-            (1.5 * f - 2.5) * f * f + 1.0,
-            ((-1.5 * f + 2.0) * f + 0.5) * f,
-            (0.5 * f - 0.5) * f * f,
-        )
-        values = self.values.to(place)
-        taps = [weight * values.gather(-1, base + k - 1) for k, weight in enumerate(weights)]
-        return torch.stack(taps).sum(0)
+        """Strips about places and what is beside them; some lines at a time, as that takes sixteen times the memory."""
+        parts = zip(*(each.split(_AT_ONCE, dim=2) for each in (self.values, place - self.first)), strict=True)
+        return torch.cat([_interpolated(values, middle) for values, middle in parts], dim=2)
+
+
+def _interpolated(
+    values: Float[Tensor, "views edges lines size"], middle: Float[Tensor, "views edges lines"]
+) -> Float[Tensor, "views edges lines wide"]:
+    """Strips about their middles, counted from their first cells, by cubic convolution (Keys 1981)."""
+    t = torch.arange(-_REACH_CELLS - _BESIDE, _REACH_CELLS + _BESIDE + 1).to(middle)
+    at = (middle[..., None] + t).clamp(1, values.shape[-1] - 2)
+    base = at.floor().clamp(max=values.shape[-1] - 3).long()
+    f = at - base
+    weights = (
+        ((-0.5 * f + 1.0) * f - 0.5) * f,
+        (1.5 * f - 2.5) * f * f + 1.0,
+        ((-1.5 * f + 2.0) * f + 0.5) * f,
+        (0.5 * f - 0.5) * f * f,
+    )
+    values = values.to(middle)
+    taps = [weight * values.gather(-1, base + k - 1) for k, weight in enumerate(weights)]
+    return torch.stack(taps).sum(0)
 
 
 def _mean(seen: Float[Tensor, "views edges lines wide"], there: Tensor) -> Float[Tensor, "views edges wide"]:

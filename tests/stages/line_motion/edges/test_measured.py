@@ -69,8 +69,12 @@ def test_a_still_sheet_stays_to_the_bit() -> None:
             [sheet(shaken()), Stripe(STANDING + 140, STANDING + 160, 220.0)],
             "its edges along the travel contradict each other, and the object's shape does not show it",
         ),
+        (  # a rail of the machine over the sheet, which parts it
+            [sheet(shaken()), Stripe(STANDING + 140, STANDING + 160, 220.0, Z - 10)],
+            "fewer than two straight edges along the travel show it",
+        ),
     ],
-    ids=["one side", "no side", "a curved side", "a shadow"],
+    ids=["one side", "no side", "a curved side", "a shadow", "a rail over it"],
 )
 def test_what_does_not_show_it_is_said(stripes: list[Stripe], words: str) -> None:
     found = measured(stripes)
