@@ -18,7 +18,7 @@ from lsvision.image.tiling import tiles
 from lsvision.types import LineImage, missing_ranges
 
 _REACH = 2  # samples beside a position that an interpolation reads
-_TILE, _LINES = (128, 1024), 32  # that stay in the processor's cache
+_TILE, _LINES = (128, 1024), 8  # that stay in the processor's cache
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lsvision.geometry import ProductFrame, Rectification, color_shift, registered_rows, zero_disparity_mm
+from lsvision.image.resampled import ResampledImage
 from lsvision.image.stereo.relation import PairRelation
+from lsvision.stages.line_motion.ideal_images import ideal_images
 from lsvision.types import LineImage, Scan, StereoPair
 
 
@@ -18,12 +20,23 @@ class ObjectPlace:
 
     Attributes:
         depth_mm: how far away its middle is, by line. beside_mm: how far beyond the middle each of its columns lies.
-        moved_px: by how many columns it stands beside its usual place, by line.
+        moved_px: by how many columns it stands beside its usual place, by line. first_column: of its columns.
     """
 
     depth_mm: Float[Tensor, " lines"]
     beside_mm: Float[Tensor, " columns"]
     moved_px: Float[Tensor, " lines"]
+    first_column: int = 0
+
+    @property
+    def columns(self) -> Float[Tensor, " columns"]:
+        """Its columns, px, float64."""
+        return self.first_column + torch.arange(len(self.beside_mm), dtype=torch.float64)
+
+    @property
+    def profile_mm(self) -> Float[Tensor, " columns"]:
+        """How far away each of its columns is, on average."""
+        return self.depth_mm.mean() + self.beside_mm
 
 
 @dataclass(frozen=True)
@@ -31,7 +44,7 @@ class ColorPair:
     """The two colours of a scan that look furthest apart along Y.
 
     Attributes:
-        relation: of the scan's two images.
+        images: those of the scan, or of the ideal pair that stands for a raw one. relation: of the scan's two images.
         channels: of the colour that sees a piece of the object last, and of the one that sees it first.
         shift: lines by which each colour looks beyond green at z0, by channel.
         place: of the object; the further away it is, the further apart the colours' lines look.
@@ -85,19 +98,17 @@ class ColorPair:
 
 
 def color_pair(scan: Scan, frame: ProductFrame, relation: PairRelation | None, place: ObjectPlace) -> ColorPair | None:
-    """The two colours of a scan that look furthest apart; None where all look at one line, or nothing was matched.
-
-    Nor are there any of a raw pair: its images show a column of the ideal pair elsewhere, and at another moment.
-    """
-    if Rectification.of(scan.raw_rig) is not None:
-        return None
+    """The two colours of a scan that look furthest apart; None where all look at one line, or nothing was matched."""
     shift = color_shift(scan)
     if shift is None or relation is None or not isinstance(scan.images, StereoPair):
         return None
     channels = int(shift.argmin()), int(shift.argmax())
     if scan.travel.transport == "reverse":
         channels = channels[::-1]
-    return ColorPair(scan, scan.images, frame, relation, channels, shift, place)
+    rectification, images = Rectification.of(scan.raw_rig, frame.n), scan.images
+    if rectification is not None:
+        images = ideal_images(scan, rectification, place.columns, place.profile_mm)
+    return ColorPair(scan, images, frame, relation, channels, shift, place)
 
 
 def at_rows(values: Float[Tensor, "rows ..."], row: Float[Tensor, " lines"]) -> Float[Tensor, "lines ..."]:
@@ -112,4 +123,8 @@ def _read(image: LineImage, channel: int, rows: Tensor) -> Float[Tensor, "rows w
     """One colour of neighbouring rows of an image; beyond its ends those are repeated."""
     inside = rows.clamp(0, image.shape[0] - 1)
     first, last = int(inside[0]), int(inside[-1])
-    return image.read(first, last + 1)[..., channel][inside - first].float()
+    if isinstance(image, ResampledImage):
+        shown = image.read_as(range(first, last + 1), lambda values: values[..., [channel]].float())[..., 0]
+    else:
+        shown = image.read(first, last + 1)[..., channel]
+    return shown[inside - first].float()

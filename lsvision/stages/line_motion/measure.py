@@ -134,7 +134,7 @@ class _Shown:
         column = (self.columns.start + self.columns.stop - 1) / 2
         still = motion.values.new_tensor([slope_at(frame.rig, column) * middle, middle]).expand(motion.lines, 2)
         seen, _ = project(frame.rig, *shaken(still, motion.values, middle_point(frame.rig)).unbind(-1))
-        return ObjectPlace(middle + deeper_mm, (self.z - middle).nan_to_num(), seen - column)
+        return ObjectPlace(middle + deeper_mm, (self.z - middle).nan_to_num(), seen - column, self.columns.start)
 
     def on_section(self, section: Section, config: LineMotionConfig) -> "_Shown":
         """With a section in place of the profile, where it is one of it."""

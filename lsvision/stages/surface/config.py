@@ -14,16 +14,16 @@ class SurfaceConfig(Checked):
     another object. Deviations of candidates are taken from the profile of their surroundings, ``local_mm`` long, moved
     and rolled as each row is: so neither a bend of the object nor a motion that was left makes one.
 
-    Deviations are smoothed by a Gaussian of the standard deviation ``smoothing_mm``. A candidate is a connected place
-    beyond ``low_sigma`` standard deviations of sound surface that somewhere exceeds ``high_sigma`` and
-    ``least_depth_mm``, and is ``least_area_mm2`` large. Its depth is that of a paraboloid about its deepest place, and
-    makes good what the windows of the matching blur: ``matching_blur`` cells of the product (standard deviation), as
-    measured on rendered pits with a ``refine_window`` of 9 px; 0 for depths of the camera's own.
+    Deviations are smoothed by a Gaussian of the standard deviation ``smoothing_mm``, two cells at least. A candidate is
+    a connected place beyond ``low_sigma`` standard deviations of sound surface that somewhere exceeds ``high_sigma``
+    and ``least_depth_mm``, and is ``least_area_mm2`` large. Its depth is that of a paraboloid about its deepest place,
+    and makes good what the windows of the matching blur: ``matching_blur`` cells of the product (standard deviation),
+    as measured on rendered pits with a ``refine_window`` of 9 px; 0 for depths of the camera's own.
 
     Places beyond ``color_low_sigma`` and somewhere ``color_high_sigma`` in relative brightness, which at least departs
-    by ``least_contrast``, are candidates by their colour alone. Within ``margin_mm`` of the ends and gaps of the
-    profile, where windows of the matching see more than one height, nothing is looked for. The ``most_candidates`` that
-    stand out most are kept.
+    by ``least_contrast``, are candidates by their colour alone. Within ``margin_mm``, or twelve cells, of the ends and
+    gaps of the profile, where windows of the matching see more than one height, nothing is looked for. The
+    ``most_candidates`` that stand out most are kept.
 
     Marks repeat where at least ``least_marks`` of one kind follow each other at the same place around the object, to
     ``mark_tolerance_mm``, with a period within ``mark_period_mm``.

@@ -24,6 +24,8 @@ from lsvision.stages.surface.strips import (
 )
 from lsvision.types import ProductSource
 
+_LEAST_MARGIN = 12  # cells: windows of the matching are so wide on the coarsest cameras, too
+
 
 @dataclass(frozen=True)
 class SurfacePlan:
@@ -49,7 +51,8 @@ class SurfacePlan:
             Smoothing.of(config.smoothing_mm, pitch, config.matching_blur),
         )
         sound = sound_surface(source, profile, unrolling, smoothing, config)
-        return cls(profile, unrolling, smoothing, sound, ~near_ends(profile, unrolling, config.margin_mm))
+        margin = max(config.margin_mm, _LEAST_MARGIN * pitch)
+        return cls(profile, unrolling, smoothing, sound, ~near_ends(profile, unrolling, margin))
 
 
 def find_candidates(

@@ -15,7 +15,9 @@ from torch import Tensor
 _REACH = 3.0  # standard deviations, where the Gaussian is cut off
 _LEAST_SHARE = 0.35  # of the Gaussian's weight that was measured
 _FIT_MM = (0.5, 0.75, 1.0, 1.5, 2.0)  # radii of the discs over which a paraboloid is fitted
-_LEAST_FIT = 1.5  # cells
+_LEAST_FIT = 5.0  # cells: errors of the matching are alike over about as many
+_LEAST_SMOOTHING = 2.0  # cells
+_MOST_UNBLURRED = 0.5  # of a value, that is made good of what was blurred
 _FILLED = 8  # rounds of filling what is missing of a disc
 _WHOLE = 0.6  # share of a disc that must be measured
 
@@ -30,7 +32,8 @@ class Smoothing:
     @classmethod
     def of(cls, smoothing_mm: float, pitch_mm: float, blur: float) -> "Smoothing":
         """For cells of a size, of depths that are blurred by a Gaussian of ``blur`` cells."""
-        return cls(smoothing_mm / pitch_mm, tuple(Paraboloid.of(radius, pitch_mm, blur) for radius in _FIT_MM))
+        sigma = max(_LEAST_SMOOTHING, smoothing_mm / pitch_mm)
+        return cls(sigma, tuple(Paraboloid.of(radius, pitch_mm, blur) for radius in _FIT_MM))
 
     @property
     def radius(self) -> int:
@@ -126,4 +129,5 @@ class Paraboloid:
         y, x = (xy * by_x - 2 * xx * by_y) / turn, (xy * by_y - 2 * yy * by_x) / turn
         near = (turn > 0) & (torch.hypot(y, x) <= self.reach / 2)
         lowest = torch.where(near, middle + (by_y * y + by_x * x) / 2, middle)
-        return lowest - self.blur**2 * (yy + xx)
+        most = _MOST_UNBLURRED * lowest.abs()
+        return lowest - (self.blur**2 * (yy + xx)).clamp(-most, most)

@@ -13,7 +13,8 @@ from lsvision.simulation import Acquisition, MotionConfig, SceneConfig, SensorCo
 from lsvision.simulation.rail import corrugation_mm, crown_place
 from lsvision.simulation.trajectory import cast_rays
 from lsvision.stages.disparity.config import DisparityConfig
-from lsvision.stages.disparity.depth import MatchedDepth, relation_of_scan
+from lsvision.stages.disparity.depth import depth_of as matched_depth
+from lsvision.stages.disparity.depth import relation_of_scan
 from lsvision.stages.line_motion.color_pair import ObjectPlace, at_rows, color_pair
 from lsvision.stages.line_motion.color_registration import register_color
 from lsvision.stages.line_motion.config import LineMotionConfig
@@ -22,7 +23,17 @@ from lsvision.stages.line_motion.measure import measure_line_motion
 from lsvision.stages.line_motion.profiles import LineSamples, columns_of, reference_profile
 from lsvision.stages.line_motion.register import placed
 from lsvision.stages.line_motion.shape import longer_waves
-from lsvision.types import Depth, LineMotion, Motion, Scan, StereoPair, TensorImage
+from lsvision.types import (
+    Depth,
+    DepthSource,
+    LineMotion,
+    Motion,
+    RawRig,
+    Rig,
+    Scan,
+    StereoPair,
+    TensorImage,
+)
 from tests.stages.rendered import BOARD, FULL_RIG
 
 PITCH, FIRST, WIDTH = 0.28, 620, 620  # columns of a quarter of the camera that show the rail
@@ -49,6 +60,7 @@ def rail(
     seed: int = 0,
     registered: bool = True,
     lengths_mm: tuple[float, float] = (VIBRATION_MM, CORRUGATION_MM),
+    cameras: Rig | RawRig | None = None,
 ) -> tuple[Simulation, Scan]:
     """A rail with amplitudes of vibration in depth and of corrugation, and their wavelengths."""
     scene = SceneConfig("rail", corrugation_mm=wave_mm, corrugation_wavelength_mm=lengths_mm[1], seed=seed)
@@ -56,16 +68,17 @@ def rail(
         AT_REST, vibration_z_mm=vibration_mm / math.sqrt(2), vibration_wavelengths_mm=lengths_mm[:1], seed=seed
     )
     sensor = SensorConfig(supersampling=2, seed=seed, color_registered=registered)
-    source = simulate(rig(), BOARD, scene, motion, sensor, Acquisition(PITCH, lines=lines))
+    source = simulate(cameras or rig(), BOARD, scene, motion, sensor, Acquisition(PITCH, lines=lines))
     left, right = (TensorImage(torch.cat(list(source.strips(camera)))) for camera in ("left", "right"))
-    return source, Scan(Path("rail"), source.rig, source.travel, StereoPair(left, right), registered)
+    images = StereoPair(left, right)
+    return source, Scan(Path("rail"), source.rig, source.travel, images, registered, raw_rig=source.raw_rig)
 
 
 @dataclasses.dataclass(frozen=True)
 class Plain:
     """Matched depth without its sigma, as the archive measures on."""
 
-    depth: MatchedDepth
+    depth: DepthSource
 
     @property
     def lines(self) -> int:
@@ -75,14 +88,13 @@ class Plain:
         return Depth(self.depth.read(start, stop).z)
 
 
-def depth_of(scan: Scan) -> Plain:
-    config = DisparityConfig()
-    return Plain(MatchedDepth(scan.images, scan.rig, config, known_relation=relation_of_scan(scan, config)))
+def depth_of(scan: Scan, n: Tensor | None = None) -> Plain:
+    return Plain(matched_depth(scan, n=n))
 
 
 def measured(source: Simulation, scan: Scan, config: LineMotionConfig = CONFIG) -> LineMotion:
     n = source.trajectory.n
-    return measure_line_motion(scan, depth_of(scan), Motion(n, torch.zeros(3, 3).double()), config).motion
+    return measure_line_motion(scan, depth_of(scan, n), Motion(n, torch.zeros(3, 3).double()), config).motion
 
 
 def amplitudes(source: Simulation, values: Tensor) -> Tensor:
