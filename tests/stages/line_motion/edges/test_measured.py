@@ -9,9 +9,13 @@ from torch import Tensor
 from lsvision.geometry import slope_at
 from lsvision.stages.line_motion import flat, measure
 from lsvision.stages.line_motion.edges import measured as edges
+from lsvision.stages.line_motion.edges.flat_object import FlatObject
+from lsvision.stages.line_motion.estimate import not_measured
+from lsvision.stages.line_motion.profiles import Reference
 from lsvision.types import Motion, TensorImage
 from tests.stages.line_motion.edges.drawn import (
     CONFIG,
+    FRAME,
     LINE,
     LINES,
     RIG,
@@ -116,3 +120,13 @@ def test_edges_are_not_looked_for_where_the_profile_shows_it(monkeypatch: pytest
     depth = dataclasses.replace(depth, z=TensorImage((round_ + 0.02 * noise).float()[..., None]))
     found = measure.measure_line_motion(scan, depth, Motion(N, torch.zeros(3, 3).double()), CONFIG).motion
     assert found.findings[0].state != "not observed"
+
+
+def test_too_many_or_too_few_lines_are_said() -> None:
+    scan, _ = scan_of([sheet(shaken(0.0))])
+    flat_object = FlatObject(FRAME, 0.0, 0.0, 0.0, 300.0, Reference(0.0, 1.0, STANDING, STANDING), True)
+    for lines, words in ((40_000, "no more than 32768 lines"), (10, "fewer than two straight edges")):
+        still, level = not_measured(lines, ""), torch.zeros(lines, 3).double()
+        said = edges.measure_edges(scan, flat_object, still, level, torch.ones(lines, dtype=torch.bool), CONFIG)
+        assert isinstance(said, str)
+        assert words in said
