@@ -221,6 +221,6 @@ def sheet_table(scenarios: Mapping[str, Scenario]) -> Table:
         ),
         rows,
         "The profile of a flat sheet shows by how much each line is displaced in depth and rolled. Its straight edges "
-        "along the travel show by how much sideways, but for the trend, which looks like a sheared sheet. Displacement "
-        "along the travel is not observed, and stays. A log shows all of it.",
+        "along the travel show by how much sideways, but for the trend, which looks like a sheared sheet: that follows "
+        "from the waves of the motion. Displacement along the travel is not observed, and stays; a log shows it.",
     )

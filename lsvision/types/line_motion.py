@@ -28,7 +28,8 @@ class LineFinding:
     units of the logarithm of the likelihood. ``reason`` says why nothing was observed, where that is not the object's
     shape. ``shape_rms`` is what the profile shows besides and belongs to the object's shape along its travel: it stays
     in the height. Waves up to ``separated_up_to_mm`` were separated from such shape by the colours' lines.
-    ``edges`` is how many straight edges along the travel show the component, where the profile does not.
+    ``edges`` is how many straight edges along the travel show the component, where the profile does not; ``waves`` of
+    how many waves it consists, where their trend over a flat object was taken for motion.
     """
 
     component: LineComponent
@@ -41,6 +42,7 @@ class LineFinding:
     shape_rms: NonNegative = 0.0
     separated_up_to_mm: float | None = None
     edges: NonNegativeInt = 0
+    waves: NonNegativeInt = 0
 
     @property
     def in_words(self) -> str:
@@ -48,6 +50,7 @@ class LineFinding:
         name, (unit, scale) = _NAMES[self.component], _SHOWN[self.component]
         shape = f"; {self.shape_rms * scale:.2g} {unit} rms are the object's shape" if self.shape_rms > 0 else ""
         edges = f", from {self.edges} straight edges along the travel" if self.edges else ""
+        edges += f" and the trend of its {self.waves} waves" if self.waves else ""
         if self.state == "absent":
             return f"{name}: nothing above the errors of a line, {self.sigma * scale:.2g} {unit}{edges}{shape}"
         if self.state == "not observed":
@@ -67,7 +70,8 @@ class LineMotion:
     On line v the object is displaced by (δx, 0, δz) mm and turned by the roll ρ (rad) about Y through c = (B/2, 0, z0);
     δy, mm, is added to the nominal travel of the line. The mean and the linear trend over the travel are zero where the
     motion was estimated from its scan alone: they belong to the pose of the object and to n. Where n comes from several
-    scans, as in a calibration, the trend by which a scan departs from it stays; its uncertainty is part of n's.
+    scans, as in a calibration, the trend by which a scan departs from it stays; its uncertainty is part of n's. So does
+    that of δx over a flat object where it follows from the waves of the motion.
 
     Attributes:
         values: (δx, δz, ρ, δy) by line, float64; zero for a component that is not corrected.

@@ -1,6 +1,5 @@
 """The local server of the page: on 127.0.0.1 alone, for reading alone, without anything from elsewhere."""
 
-import json
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -11,6 +10,7 @@ from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
 from lsvision.errors import LsvisionError
+from lsvision.io.json_file import json_text
 from lsvision.viewer.product_view import ProductView
 
 ADDRESS = "127.0.0.1"
@@ -102,7 +102,7 @@ def _span_of(query: dict[str, list[str]]) -> tuple[float, float] | None:
 
 
 def _json(data: dict[str, Any]) -> _Answer:
-    return _Answer(json.dumps(data, allow_nan=False).encode(), "application/json")
+    return _Answer(json_text(data).encode(), "application/json")
 
 
 def serve(view: ProductView, port: int, started: Callable[[str], None]) -> None:
