@@ -62,7 +62,7 @@ def test_a_shaken_sheet_is_known_as_well_as_its_sigma_says(
     found = measured(scan, source.trajectory.n)
     sideways, deep, over_sigma = errors(found, source.trajectory.vibration(torch.arange(scan.lines))[:, :2]).tolist()
     assert (found.findings[0].state, found.findings[0].edges) == ("corrected", edges)
-    assert found.findings[0].waves == 3
+    assert found.findings[0].waves >= 3
     assert sideways < 0.05
     assert deep < 0.01
     assert 0.75 < over_sigma < 1.3
