@@ -31,9 +31,8 @@ class Stripe:
 
 
 def shaken(rms_mm: float = 0.5) -> Tensor:
-    """Displacement sideways by line."""
-    wave = torch.sin(LINE * PITCH / 12.0) + torch.sin(LINE * PITCH / 25.0 + 1.0)
-    return rms_mm * without_trend(LINE)(wave)
+    """Displacement sideways by line: two waves, of which the object is as long as one and a half and three."""
+    return rms_mm * (torch.sin(LINE * PITCH / 12.0) + torch.sin(LINE * PITCH / 25.0 + 1.0))
 
 
 def along(x_mm: float, dx: Tensor, per_line_mm: float = 0.0) -> Tensor:
@@ -81,5 +80,6 @@ def measured(stripes: list[Stripe], seed: int = 0, config: LineMotionConfig = CO
 
 
 def errors_of(found: LineMotion, dx: Tensor) -> Tensor:
-    """Errors of δx, in units of their standard deviation."""
-    return (found.dx_mm - without_trend(LINE)(dx)) / found.sigma[:, 0]
+    """Errors of δx but for their mean, and their trend where no waves show it, in units of their standard deviation."""
+    off = found.dx_mm - dx
+    return (off - off.mean() if found.findings[0].waves else without_trend(LINE)(off)) / found.sigma[:, 0]
