@@ -23,7 +23,7 @@ _STEPS, _SETTLED = 30, 1e-8
 _LEAST_GAIN = 12.0  # of the logarithm of the likelihood, for one wave more
 _MOST_LEFT = 2.0  # mean square of what is left over its variance, of each component
 _FLOOR = 0.3  # of the usual sigma of the least known component: none is that much surer
-_LASTING = 0.5  # of the usual sigma of a line, by which an edge may be bent or askew all along
+_LASTING = 0.3  # of the usual sigma of a line, by which an edge may be bent or askew all along
 _PARTS, _SLOW = 10, 4  # of the object, over which slow errors are summed; what the fit takes of them
 
 
