@@ -51,10 +51,15 @@ def shaken_rail(folder: Path, scale: int, lines: int) -> Simulation:
         SensorConfig(supersampling=1),
         Acquisition(PITCH_MM * scale, lines=lines),
     )
-    write_scan(folder / "scan", NewScan(rail.rig, rail.travel, rail.strips("left"), rail.strips("right"), rail.lines))
-    n = Motion(rail.trajectory.n, 1e-10 * torch.eye(3, dtype=torch.float64))
-    write_calibration(Calibration("joint", n, 1.0, 0.1, (), (), Observability((), ""), rail.rig), folder / "n.json")
+    write_with_true_n(rail, folder)
     return rail
+
+
+def write_with_true_n(made: Simulation, folder: Path) -> None:
+    """Write a rendered scan, ``scan``, and a calibration that knows its n, ``n.json``."""
+    write_scan(folder / "scan", NewScan(made.rig, made.travel, made.strips("left"), made.strips("right"), made.lines))
+    n = Motion(made.trajectory.n, 1e-10 * torch.eye(3, dtype=torch.float64))
+    write_calibration(Calibration("joint", n, 1.0, 0.1, (), (), Observability((), ""), made.rig), folder / "n.json")
 
 
 @dataclass(frozen=True)

@@ -17,18 +17,18 @@ from typing import Any
 
 import cv2
 import torch
-from line_motion import FULL_RIG, PITCH_MM, WITHOUT, corrected
+from line_motion import FULL_RIG, PITCH_MM, WITHOUT, corrected, write_with_true_n
 from torch import Tensor
 from torch.nn.functional import pad
 
 from lsvision.archive import LineMotionChoice
 from lsvision.geometry import scaled_rig, without_trend
 from lsvision.image.tiling import keep_freed_memory
-from lsvision.io import NewScan, Product, write_calibration, write_line_motion, write_scan
+from lsvision.io import Product, write_line_motion
 from lsvision.simulation import Acquisition, MotionConfig, SceneConfig, SensorConfig, Simulation, simulate
 from lsvision.simulation.sheet_points import points_in_product
 from lsvision.stages.line_motion.config import LineMotionConfig
-from lsvision.types import Board, Calibration, LineMotion, Motion, Observability, TensorImage
+from lsvision.types import Board, LineMotion, TensorImage
 
 ASKED_MM = 0.05
 MOTION = MotionConfig(angle_x_deg=2.0, angle_z_deg=1.5, stretch=1.0246)
@@ -57,9 +57,7 @@ def sheet(folder: Path, scale: int, scene: SceneConfig, motion: MotionConfig) ->
         SensorConfig(seed=scene.seed),
         Acquisition(PITCH_MM * scale),
     )
-    write_scan(folder / "scan", NewScan(made.rig, made.travel, made.strips("left"), made.strips("right"), made.lines))
-    n = Motion(made.trajectory.n, 1e-10 * torch.eye(3, dtype=torch.float64))
-    write_calibration(Calibration("joint", n, 1.0, 0.1, (), (), Observability((), ""), made.rig), folder / "n.json")
+    write_with_true_n(made, folder)
     return made
 
 

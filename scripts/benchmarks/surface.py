@@ -12,19 +12,18 @@ from pathlib import Path
 
 import cv2
 import torch
-from line_motion import FULL_RIG, MOTION, PITCH_MM, WITHOUT, corrected
+from line_motion import FULL_RIG, MOTION, PITCH_MM, WITHOUT, corrected, write_with_true_n
 from torch import Tensor
 
 from lsvision.archive import LineMotionChoice
 from lsvision.archive.inspection import inspect_product
 from lsvision.geometry import product_pose, scaled_rig, transform
 from lsvision.image.tiling import keep_freed_memory
-from lsvision.io import NewScan, write_calibration, write_scan
 from lsvision.simulation import Acquisition, SceneConfig, SensorConfig, Simulation, simulate
 from lsvision.simulation.defects import SCRATCH_LENGTH_MM, Cells, drawn_pits, drawn_scratches
 from lsvision.stages.surface.config import SurfaceConfig
 from lsvision.stages.surface.marks import MarkedSurface
-from lsvision.types import Board, Calibration, Candidate, Motion, Observability
+from lsvision.types import Board, Candidate
 
 SCENE = SceneConfig(kind="rail", pit_depth_mm=(0.2, 0.2001), pit_radius_mm=(2.0, 3.0), defect_spacing_mm=100.0)
 RAILS = {"matt": SCENE, "glossy": replace(SCENE, seed=1, rail_gloss=0.1, lights="along")}
@@ -135,9 +134,7 @@ def rail_of(folder: Path, scale: int, scene: SceneConfig) -> Simulation:
     acquisition = Acquisition(pitch, lines=round(LENGTH_MM / pitch))
     board, sensor = Board(12, 9, 30.0), SensorConfig(supersampling=1)
     rail = simulate(scaled_rig(FULL_RIG, scale), board, scene, MOTION, sensor, acquisition)
-    write_scan(folder / "scan", NewScan(rail.rig, rail.travel, rail.strips("left"), rail.strips("right"), rail.lines))
-    n = Motion(rail.trajectory.n, 1e-10 * torch.eye(3, dtype=torch.float64))
-    write_calibration(Calibration("joint", n, 1.0, 0.1, (), (), Observability((), ""), rail.rig), folder / "n.json")
+    write_with_true_n(rail, folder)
     return rail
 
 

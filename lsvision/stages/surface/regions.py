@@ -119,6 +119,7 @@ def _roots(count: int, touching: list[Tensor]) -> Int[Tensor, " parts"]:
     parent = list(range(count))
 
     def root(part: int) -> int:
+        """The part that stands for all that are known to touch this one; paths to it are halved on the way."""
         while parent[part] != part:
             parent[part] = parent[parent[part]]
             part = parent[part]

@@ -83,7 +83,7 @@ def _apart(smoothing: Smoothing) -> int:
 
 
 def _planes(strip: SurfaceStrip, level: SoundSurface, smoothing: Smoothing) -> Float[Tensor, "planes rows cells"]:
-    """Rows of a window that count: departures smoothed, fitted, as they are and averaged; smoothed contrast."""
+    """Rows of a window that count: departures smoothed, as they are and averaged; smoothed contrast."""
     departure = strip.departure
     planes = [
         smoothing.smooth(departure),
